@@ -207,19 +207,17 @@ class Task(Problem):
 
     def misses(self, values: FloatArray) -> FloatArray:
         """Of impedances, at the area that the deck's amplitude causes."""
-        data, on, n = self.data, driving_sources(self.circuit), self.data.values.size
+        data, on, skin = self.data, driving_sources(self.circuit), "swept" if self.skin == "follow" else "own"
         # Rows that differ in a sine's frequency alone are one sweep; with AC, a sweep would have its amplitude.
-        conditions, z = dict(data.conditions), np.empty(n, complex)
+        conditions, z, sweeps = dict(data.conditions), np.empty(data.values.size, complex), dict[Any, list[int]]()
         plain = len(on) == 1 and isinstance(on[0].waveform, Sine) and all(e.ac is None for e in self.circuit.elements)
         f = conditions.pop(f"{on[0].name}.frequency", None) if plain else None
-        others = [*conditions.values(), *self.places.values(), np.arange(n) if f is None else np.zeros(n)]
-        _, first, sweep = np.unique(np.array(others), axis=1, return_index=True, return_inverse=True)
-        for number, row in enumerate(first.tolist()):
-            rows = sweep.ravel() == number
-            at, skin = None if f is None else f[rows], "swept" if self.skin == "follow" else "own"
-            found = phasor(self.scene(values, row, data.conditions), at, skin=skin).impedance
-            if found is None:
-                raise InputError("several sources see no impedance; allowed: a circuit with one source")
+        for i, shared in enumerate(zip(*conditions.values(), *self.places.values(), strict=True)):
+            sweeps.setdefault(i if f is None else shared, []).append(i)
+        for rows in sweeps.values():
+            scene = self.scene(values, rows[0], data.conditions)
+            found = phasor(scene, None if f is None else f[rows], skin=skin).impedance
+            refuse(found is None, "several sources see no impedance; allowed: a circuit with one source")
             z[rows] = found
         off = np.abs(z) - data.values
         if data.phase is not None:
@@ -457,7 +455,7 @@ def _request(
         refuse(path.lower() not in map(str.lower, fitted), said)
     data = _data_of(circuit, given, by)
     names, paths, places = list[str](), list[str](), dict[str, IntArray]()
-    of = data.groups.get(by or "", ())
+    (of,) = data.groups.values() or ((),)
     every = list(dict.fromkeys(of))
     for path in fitted:
         value = circuit.parameters[path].value
@@ -496,7 +494,7 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
         variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
     # The geometric mean of one value is that value to the last digit.
     means = {path: best.values[np.unique(at)] for path, at in task.places.items()}
-    labels = [(of, label) for of in data.groups.values() for label in dict.fromkeys(of)]
+    (of,) = data.groups.values() or ((),)
     return Fit._reported(
         task, best, variance, reach, best.beyond_sigma(..., freedom) if data.sigma is not None else [], profiles,
         data=data,
@@ -505,7 +503,7 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
         objectives=tuple(end.objective for end in ends),
         freedom=freedom,
         circuit=task.circuit.varied({path: float(np.prod(x ** (1.0 / x.size))) for path, x in means.items()}),
-        circuits={label: task.scene(best.values, of.index(label), {}) for of, label in labels},
+        circuits={label: task.scene(best.values, of.index(label), {}) for label in dict.fromkeys(of)},
     )  # fmt: skip
 
 
