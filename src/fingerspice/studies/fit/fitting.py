@@ -154,7 +154,8 @@ class Problem:
         self, bounds: Mapping[str, tuple[float, float]], profiles: bool | Sequence[str]
     ) -> tuple[Self, Sequence[str]]:
         """With bounds as given, and a start moved into them; and the names whose profiles are wanted, as they are."""
-        count, circuit, pairs = len(self.paths), self.circuit, dict.fromkeys(self.paths, (0.0, math.inf))
+        count, circuit = len(self.paths), self.circuit
+        pairs: dict[str, tuple[float, ...]] = dict.fromkeys(self.paths, (0.0, math.inf))
         few = f"{self.scale.size} data cannot tell {count} parameters; allowed: at least as many data"
         refuse(self.scale.size < count, few)
         spelled = {path.lower(): path for path in self.paths}

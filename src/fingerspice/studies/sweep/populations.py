@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice import sets
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
-from fingerspice.sets.parameters import KINDS
-from fingerspice.sets.parameters import parameters as known_sets
 from fingerspice.studies.batch.batch import REFUSED, batch, own_path
 from fingerspice.waveforms.waveform import Waveform, require
 
@@ -59,12 +58,12 @@ class Plan:
         self.own: dict[str, Mapping[str, float | FloatArray]] = {}
         self.names: dict[str, tuple[str, ...]] = {}  # Of the sets that a name counts
         self.units: dict[str, str] = {}
-        for kind in (kind for kind in KINDS if kind in asked):
+        for kind in (kind for kind in sets.KINDS if kind in asked):
             if isinstance(asked[kind], str):
                 circuit = _applied(circuit, kind, asked[kind])[0]
             else:
                 circuit, self.names[kind], self.own[kind] = _together(circuit, kind, asked[kind])
-        rest = [name for name in asked if name in self.names or name not in KINDS]
+        rest = [name for name in asked if name in self.names or name not in sets.KINDS]
         if not rest:
             raise InputError(f"parameters is {dict(asked)!r}, and nothing varies; allowed: a list of sets, an array or "
                              "a distribution beside it")  # fmt: skip
@@ -176,7 +175,7 @@ def _applied(circuit: Circuit, kind: str, entry: str) -> tuple[Circuit, str, Map
     """The circuit with a set, the set's name as the sweep shows it, and the values that it gives by path."""
     to, _, name = (part.strip() for part in entry.rpartition("="))
     try:
-        one = known_sets(name, kind)
+        one = sets.parameters(name, kind)
         changed = one.apply(circuit, to or None)
     except InputError as error:
         raise InputError(f"{kind} {entry!r}: {error.message}") from None
