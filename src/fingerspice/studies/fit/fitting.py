@@ -154,16 +154,14 @@ class Problem:
         self, bounds: Mapping[str, tuple[float, float]], profiles: bool | Sequence[str]
     ) -> tuple[Self, Sequence[str]]:
         """With bounds as given, and a start moved into them; and the names whose profiles are wanted, as they are."""
-        count, circuit = len(self.paths), self.circuit
-        pairs: dict[str, tuple[float, ...]] = dict.fromkeys(self.paths, (0.0, math.inf))
-        few = f"{self.scale.size} data cannot tell {count} parameters; allowed: at least as many data"
-        refuse(self.scale.size < count, few)
-        spelled = {path.lower(): path for path in self.paths}
-        for path, given in bounds.items():
-            unknown = f"bounds names {path}, which is not fitted; allowed: {', '.join(self.paths)}"
-            refuse(path.lower() not in spelled, unknown)
-            pairs[spelled[path.lower()]] = tuple(given)
-        for path, pair in pairs.items():
+        n, count, circuit, box = self.scale.size, len(self.paths), self.circuit, []
+        refuse(n < count, f"{n} data cannot tell {count} parameters; allowed: at least as many data")
+        given, fitted = {path.lower(): tuple(pair) for path, pair in bounds.items()}, ", ".join(self.paths)
+        for path in bounds:
+            known = path.lower() in map(str.lower, self.paths)
+            refuse(not known, f"bounds names {path}, which is not fitted; allowed: {fitted}")
+        for path in self.paths:
+            pair = given.get(path.lower(), (0.0, math.inf))
             wrong = len(pair) != 2 or not 0.0 <= pair[0] < pair[1]
             refuse(wrong, f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
             value = circuit.parameters[path].value
@@ -172,13 +170,13 @@ class Problem:
                 said = f"{path} is {value:g}, outside its bounds {pair[0]:g} to {pair[1]:g}: it starts at {moved:g}"
                 warnings.warn(said, FingerspiceWarning, stacklevel=3)
                 circuit = circuit.varied({path: moved})
-        known = {name.lower(): name for name in self.names}
-        wanted = ([*known] if profiles else []) if isinstance(profiles, bool) else profiles
+            box.append(pair)
+        names = {name.lower(): name for name in self.names}
+        wanted = ([*names] if profiles else []) if isinstance(profiles, bool) else profiles
         for name in wanted:
             said = f"profiles names {name!r}, which is not fitted; allowed: True, or {', '.join(self.names)}"
-            refuse(not isinstance(name, str) or name.lower() not in known, said)
-        box = np.array([pairs[path] for path in self.paths], float)
-        return replace(self, circuit=circuit, bounds=box), [known[name.lower()] for name in wanted]
+            refuse(not isinstance(name, str) or name.lower() not in names, said)
+        return replace(self, circuit=circuit, bounds=np.array(box, float)), [names[name.lower()] for name in wanted]
 
 
 class Fitted(NamedTuple):
