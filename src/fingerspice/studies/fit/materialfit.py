@@ -110,16 +110,17 @@ def read_table(path: Path) -> FloatArray:
 
 def _converted(name: str, x: FloatArray, file: Path) -> tuple[str, FloatArray]:
     """The column that a name in a header tells, or "", and its values in SI units."""
-    name = name.strip()
+    name, bare = name.strip(), name.strip().strip("\"'")
     for column, names, units, power, factor in _KINDS:
         # In brackets, behind a slash, or, as in f_kHz, at the name's end.
         unit = rf"(?:(?P<open>[\[(])|[/_])\s*(?P<unit>(?:{units})?)\s*(?(open)[\])])"
-        if found := re.fullmatch(rf"(?i:{names})\s*(?:{unit})?", name.strip("\"'")):
+        if found := re.fullmatch(rf"(?i:{names})\s*(?:{unit})?", bare):
             parts = found.groupdict()
             metre = _METRES[parts.get("metre") or "m"] ** (-1 if "/" in (found["unit"] or "") else 1)
             with np.errstate(divide="ignore"):
                 return column, (_PREFIXES[parts.get("prefix") or ""] * metre * x) ** power * factor
-    known = any(re.fullmatch(rf"(?i:{names})\s*[\[(/_].*", name.strip("\"'")) for _, names, *_ in _KINDS)
+    another = r"\s*(?:[\[(][^\])]*[\])]|/.+|_[^_\[(/]*)"
+    known = any(re.fullmatch(rf"(?i:{names}){another}", bare) for _, names, *_ in _KINDS)
     require(not known, f"{file}: the unit of column {name!r}", "not known", "Hz, rad/s, ohm m, S/m, and 1 or F/m")
     return "", x
 
