@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import fingerspice as fs
-from fingerspice.sets.parameters import quantity, references, tables
+from fingerspice.sets import quantity, references, tables
 
 PAGE = Path(__file__).parents[1] / "docs" / "sets.md"
 

@@ -18,7 +18,7 @@ import sets_page
 from commands import Command
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.scene import EXAMPLES
-from fingerspice.sets.parameters import DATA, ELEMENTS, KINDS, WAVEFORMS, keys_in, references, tables
+from fingerspice.sets import DATA, ELEMENTS, KINDS, WAVEFORMS, keys_in, references, tables
 from scenes import shipped
 
 ROOT = Path(__file__).parents[1]

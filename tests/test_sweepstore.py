@@ -26,7 +26,7 @@ from scipy import stats
 import fingerspice as fs
 from commands import Command, tree
 from fingerspice.studies.sweep import chunks
-from fingerspice.studies.sweep.populations import Draws, Plan
+from fingerspice.studies.sweep.populations import Plan
 from processes import forked, no_room_here
 from scenes import CIRCUITS, cases, shipped
 
@@ -120,10 +120,11 @@ def killing(pids: Callable[[], list[int]], store: Path, most: int) -> Iterator[l
 
 
 def test_draws_in_parts_are_those_of_the_whole(circuit: fs.Circuit) -> None:
-    plan = Plan(circuit, PARAMETERS, 1 << 14, 5, 1 << 30)
-    draws = plan.quantiles(stats.qmc.Sobol(2, scramble=True, bits=30, rng=5).random(plan.n))
     for count in (1 << 9, 1 << 14):
-        parts = [Draws(plan, count).part(i) for i in range(plan.n // count)]
+        plan = Plan(circuit, PARAMETERS, 1 << 14, 5, 1 << 30)
+        plan.divide(count)
+        draws = plan.quantiles(stats.qmc.Sobol(2, scramble=True, bits=30, rng=5).random(plan.n))
+        parts = [plan.draws(i) for i in range(plan.n // count)]
         for name, values in draws.items():
             np.testing.assert_array_equal(np.concatenate([part[name] for part in parts]), values)
 
@@ -335,7 +336,7 @@ def test_dask_workers_that_are_killed_again_and_again_cost_nothing(
 def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, part, write = tmp_path / "s.zarr", Draws.part, chunks.Work._write
+    path, part, write = tmp_path / "s.zarr", Plan.draws, chunks.Work._write
     begun, written, at_once = 0, 0, 0
 
     def computing(*given: Any) -> Any:
@@ -354,7 +355,7 @@ def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
         written += 1
         write(*given)
 
-    monkeypatch.setattr(Draws, "part", computing)
+    monkeypatch.setattr(Plan, "draws", computing)
     monkeypatch.setattr(chunks.Work, "_write", writing)
     with cluster_of(1, processes=False) as cluster:
         fs.sweep(circuit, PARAMETERS, store=path, scheduler=cluster.scheduler_address, **HOW)

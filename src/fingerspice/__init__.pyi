@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from fingerspice.results.outcome import Status as Status
     from fingerspice.results.runfile import load as load
     from fingerspice.results.solution import Solution as Solution
-    from fingerspice.sets.parameters import Citation as Citation
-    from fingerspice.sets.parameters import ParameterSet as ParameterSet
-    from fingerspice.sets.parameters import parameters as parameters
+    from fingerspice.sets import Citation as Citation
+    from fingerspice.sets import ParameterSet as ParameterSet
+    from fingerspice.sets import parameters as parameters
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream

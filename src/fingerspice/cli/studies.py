@@ -257,7 +257,7 @@ def _parameter(path: str, one: Any) -> Any:
     import numpy as np
     from scipy import stats
 
-    from fingerspice.sets.parameters import KINDS
+    from fingerspice.sets import KINDS
 
     if path in KINDS:
         # The sweep looks the sets up, and says what is allowed.

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
-    from fingerspice.sets.parameters import Citation
+    from fingerspice.sets import Citation
     from fingerspice.waveforms.waveform import Fundamental
 
 
@@ -398,6 +398,6 @@ class Solution(Sealed, Shown, Signalled, Figured):
         Citation
             ``print`` shows the text and the BibTeX, which is also in `Citation.bibtex`.
         """
-        from fingerspice.sets.parameters import cite
+        from fingerspice.sets import cite
 
         return cite(self.circuit, self.method)

@@ -24,7 +24,7 @@ from fingerspice.studies.batch.batch import LEAST_RTOL, REFUSED, batch, own_path
 from fingerspice.studies.batch.lockstep import lockstep_form, why_alone
 from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 try:
     import torch
@@ -45,14 +45,12 @@ class Scenes:
     ) -> None:  # fmt: skip
         require_circuit(circuit)
         gaps = len(circuit.by_device("GAP"))
-        if gaps != 1:
-            raise InputError(f"the circuit has {gaps} GAPs; allowed: one")
+        refuse(gaps != 1, f"the circuit has {gaps} GAPs; allowed: one")
         self.circuit, self.periodic, self.alone = circuit, bool(periodic), isinstance(outputs, str)
         # Names out of `SIGNALS` and `MEANS`.
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in self.outputs:
-            if name not in (*MEANS, *SIGNALS):
-                raise InputError(f"unknown output {name!r}; allowed: {', '.join((*MEANS, *SIGNALS))}")
+            refuse(name not in MEANS + SIGNALS, f"unknown output {name!r}; allowed: {', '.join(MEANS + SIGNALS)}")
         require(bool(self.outputs), "outputs", "empty", "one or more names")
         require(len(set(self.outputs)) == len(self.outputs), "outputs", repr(self.outputs), "every name once")
         signals = [name for name in self.outputs if name in SIGNALS]
@@ -65,8 +63,8 @@ class Scenes:
         # End of every run, s; none where only the periodic state is asked for
         deck = None if circuit.tran is None else circuit.tran.stop
         self.t_stop = deck if t_stop is None else positive_number("t_stop", t_stop, "s")
-        if self.t_stop is None and (signals or not periodic):
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+        endless = self.t_stop is None and (signals or not periodic)
+        refuse(endless, "no t_stop: the deck has no .tran line and none was given; give t_stop in s")
         self.rtol = rtol_given(rtol, LEAST_RTOL)
         # How many numbers each output has
         self.sizes = [1 if name in MEANS else self.t.size for name in self.outputs]
@@ -138,8 +136,8 @@ def tensor_of(path: str, one: Tensor | ArrayLike) -> Tensor:
     """A value in double precision on the processor."""
     if not isinstance(one, Tensor):
         one = torch.from_numpy(real_numbers(path, one, "a tensor or array of numbers").copy())
-    if one.is_complex() or one.dtype == torch.bool:
-        raise InputError(f"{path} is a tensor of {one.dtype}; allowed: real numbers")
+    real = not one.is_complex() and one.dtype != torch.bool
+    require(real, path, f"a tensor of {one.dtype}", "real numbers")
     return one.to("cpu", torch.float64)
 
 
@@ -284,8 +282,8 @@ class Simulator(torch.nn.Module):
             require(path not in self.paths, path, "given twice", "once")
             one = parameters[given] if isinstance(parameters, Mapping) else circuit.parameters[path].value
             value = tensor_of(given, one).detach().clone()
-            if logarithms and not bool((value > 0.0).all()):
-                raise InputError(f"{path} is {value.min():g}, and logarithms are asked for; allowed: more than 0")
+            good = not logarithms or bool((value > 0.0).all())
+            require(good, path, f"{value.min():g}, and logarithms are asked for", "more than 0")
             self.paths[path] = path.replace(".", "_")
             self.register_parameter(self.paths[path], torch.nn.Parameter(value.log() if logarithms else value))
 
@@ -328,8 +326,7 @@ class Simulator(torch.nn.Module):
         """
         given = {own_path(self.circuit, path): tensor_of(path, one) for path, one in (values or {}).items()}
         every = {path: tensor_of(path, self.value(path)) for path in self.paths if path not in given} | given
-        if not every:
-            raise InputError("there are no values; allowed: parameters of the module, or values for its call")
+        refuse(not every, "there are no values; allowed: parameters of the module, or values for its call")
         try:
             shaped = torch.broadcast_tensors(*every.values())
         except RuntimeError:
@@ -385,7 +382,6 @@ class _Run(torch.autograd.Function):
 
 def _slopes(ctx: Any, wanted: tuple[str, ...]) -> Tensor:
     """Derivatives of a run's outputs by the parameters `wanted`."""
-    if ctx.wanted:
-        raise InputError("second derivatives of a run are asked for; allowed: first derivatives")
+    refuse(ctx.wanted, "second derivatives of a run are asked for; allowed: first derivatives")
     found: Tensor = _Run.apply(ctx.scenes, ctx.paths, wanted, *ctx.saved_tensors)
     return found

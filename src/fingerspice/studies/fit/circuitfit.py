@@ -30,7 +30,7 @@ from fingerspice.studies.batch.batch import REFUSED, batch, own_path
 from fingerspice.studies.fit import fitting
 from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Problem, followed
 from fingerspice.studies.steady import phasor
-from fingerspice.waveforms.waveform import Sine, require
+from fingerspice.waveforms.waveform import Sine, refuse, require
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -116,15 +116,13 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
     names = {f"{name}_mean": name for name in _MEANS}
     names |= {name: name for name in MEASURED if name != IMPEDANCE} if _TIME in columns else {IMPEDANCE: IMPEDANCE}
     measured = [name for name in columns if name in names]
-    if len(measured) != 1:
-        what = f"several measured columns ({', '.join(measured)})" if measured else "no measured column"
-        what += f", and the columns {', '.join(columns)}"
-        raise InputError(f"{place} have {what}; allowed: one of {', '.join(names)}")
-    (name,) = measured
-    values, sigma, t, phase = (columns.pop(key, None) for key in (name, SIGMA, _TIME, PHASE))
-    assert values is not None
-    if phase is not None and name != IMPEDANCE:
-        raise InputError(f"{place} have the column {PHASE} beside {name}; allowed: beside {IMPEDANCE}")
+    what = f"several measured columns ({', '.join(measured)})" if measured else "no measured column"
+    said = f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {', '.join(names)}"
+    refuse(len(measured) != 1, said)
+    (name,), values = measured, columns.pop(measured[0])
+    sigma, t, phase = (columns.pop(key, None) for key in (SIGMA, _TIME, PHASE))
+    alone = phase is not None and name != IMPEDANCE
+    refuse(alone, f"{place} have the column {PHASE} beside {name}; allowed: beside {IMPEDANCE}")
     # A signal over time may be below 0 now and then, by noise, but not on average; magnitudes never are 0.
     each = name == IMPEDANCE or name.endswith("_mean")
     checked = values if each else values.mean(keepdims=True)
@@ -136,21 +134,20 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
             allowed += ", as the electroadhesive force counts as positive where it pulls towards the screen"
         value = f"{checked[low[0]]:g} {_UNITS[name]}".rstrip()
         raise InputError(f"{place}: {name} is {value} {where}; allowed: {allowed}")
-    if sigma is not None and not np.all(sigma > 0.0):
-        raise InputError(f"{place}: the smallest sigma is {sigma.min():g}; allowed: more than 0")
-    if t is not None and (name.endswith("_mean") or np.any(np.diff(t) <= 0.0)):
-        raise InputError(f"{place} have the column t; allowed: rising times, with a signal that is no mean")
+    least = math.inf if sigma is None else sigma.min(initial=math.inf)
+    refuse(least <= 0.0, f"{place}: the smallest sigma is {least:g}; allowed: more than 0")
     conditions: dict[str, FloatArray] = {}
+    data = Data(names[name], values, sigma, conditions, t, phase, groups)
+    if t is not None:
+        wrong = name.endswith("_mean") or np.any(np.diff(t) <= 0.0)
+        refuse(wrong, f"{place} have the column t; allowed: rising times, with a signal that is no mean")
     for column, x in columns.items():
         path = _path(circuit, column)
-        if path in conditions:
-            raise InputError(f"{place} have two columns of {path}; allowed: one")
+        refuse(path in conditions, f"{place} have two columns of {path}; allowed: one")
         conditions[path] = x
-    data = Data(names[name], values, sigma, conditions, t, phase, groups)
-    if t is not None and data.varying:
-        raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
-    if t is not None and groups:
-        raise InputError(f"{place} have times and groups; allowed: groups of means or of impedances")
+    if t is not None:
+        refuse(data.varying, f"{place} have times and changing conditions; allowed: one run over time, or means")
+        refuse(groups, f"{place} have times and groups; allowed: groups of means or of impedances")
     return data
 
 
@@ -210,19 +207,17 @@ class Task(Problem):
 
     def misses(self, values: FloatArray) -> FloatArray:
         """Of impedances, at the area that the deck's amplitude causes."""
-        data, on, n = self.data, driving_sources(self.circuit), self.data.values.size
+        data, on, skin = self.data, driving_sources(self.circuit), "swept" if self.skin == "follow" else "own"
         # Rows that differ in a sine's frequency alone are one sweep; with AC, a sweep would have its amplitude.
-        conditions, z = dict(data.conditions), np.empty(n, complex)
+        conditions, z, sweeps = dict(data.conditions), np.empty(data.values.size, complex), dict[Any, list[int]]()
         plain = len(on) == 1 and isinstance(on[0].waveform, Sine) and all(e.ac is None for e in self.circuit.elements)
         f = conditions.pop(f"{on[0].name}.frequency", None) if plain else None
-        others = [*conditions.values(), *self.places.values(), np.arange(n) if f is None else np.zeros(n)]
-        _, first, sweep = np.unique(np.array(others), axis=1, return_index=True, return_inverse=True)
-        for number, row in enumerate(first.tolist()):
-            rows = sweep.ravel() == number
-            at, skin = None if f is None else f[rows], "swept" if self.skin == "follow" else "own"
-            found = phasor(self.scene(values, row, data.conditions), at, skin=skin).impedance
-            if found is None:
-                raise InputError("several sources see no impedance; allowed: a circuit with one source")
+        for i, shared in enumerate(zip(*conditions.values(), *self.places.values(), strict=True)):
+            sweeps.setdefault(i if f is None else shared, []).append(i)
+        for rows in sweeps.values():
+            scene = self.scene(values, rows[0], data.conditions)
+            found = phasor(scene, None if f is None else f[rows], skin=skin).impedance
+            refuse(found is None, "several sources see no impedance; allowed: a circuit with one source")
             z[rows] = found
         off = np.abs(z) - data.values
         if data.phase is not None:
@@ -443,25 +438,24 @@ def _request(
     circuit: Circuit, given: Given, parameters: Sequence[str], groups: Mapping[str, Sequence[str]] | None
 ) -> tuple[Data, tuple[str, ...], tuple[str, ...], dict[str, IntArray]]:
     """The checked data; and names, paths and places, as `Task` has them, of what is to be fitted to them."""
-    if isinstance(parameters, str) or not parameters:
-        raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ['Xgap.d', 'Xgap.r']")
+    good = not isinstance(parameters, str) and bool(parameters)
+    require(good, "parameters", repr(parameters), "a sequence of paths such as ['Xgap.d', 'Xgap.r']")
     fitted = [own_path(circuit, path) for path in parameters]
     by: str | None = None
     separate: Sequence[str] = ()
     if groups is not None:
         wanted = "a mapping of a column of the data to the parameters of each group, such as {'finger': ['Xgap.d']}"
         ((by, separate),) = groups.items() if isinstance(groups, Mapping) and len(groups) == 1 else (("", ""),)
-        require(
-            isinstance(by, str) and not isinstance(separate, str) and bool(separate), "groups", repr(groups), wanted
-        )
-        if by.lower() in map(str.lower, circuit.parameters):
-            raise InputError(f"groups names the column {by!r}, which is a parameter; allowed: {wanted}")
-    lost = [path for path in separate if path.lower() not in map(str.lower, fitted)]
-    if lost:
-        raise InputError(f"groups names {lost[0]!r}, which is not fitted; allowed: {', '.join(fitted)}")
+        good = isinstance(by, str) and not isinstance(separate, str) and bool(separate)
+        require(good, "groups", repr(groups), wanted)
+        known = by.lower() in map(str.lower, circuit.parameters)
+        refuse(known, f"groups names the column {by!r}, which is a parameter; allowed: {wanted}")
+    for path in separate:
+        said = f"groups names {path!r}, which is not fitted; allowed: {', '.join(fitted)}"
+        refuse(path.lower() not in map(str.lower, fitted), said)
     data = _data_of(circuit, given, by)
     names, paths, places = list[str](), list[str](), dict[str, IntArray]()
-    of = data.groups.get(by or "", ())
+    (of,) = data.groups.values() or ((),)
     every = list(dict.fromkeys(of))
     for path in fitted:
         value = circuit.parameters[path].value
@@ -500,7 +494,7 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
         variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
     # The geometric mean of one value is that value to the last digit.
     means = {path: best.values[np.unique(at)] for path, at in task.places.items()}
-    labels = [(of, label) for of in data.groups.values() for label in dict.fromkeys(of)]
+    (of,) = data.groups.values() or ((),)
     return Fit._reported(
         task, best, variance, reach, best.beyond_sigma(..., freedom) if data.sigma is not None else [], profiles,
         data=data,
@@ -509,7 +503,7 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
         objectives=tuple(end.objective for end in ends),
         freedom=freedom,
         circuit=task.circuit.varied({path: float(np.prod(x ** (1.0 / x.size))) for path, x in means.items()}),
-        circuits={label: task.scene(best.values, of.index(label), {}) for of, label in labels},
+        circuits={label: task.scene(best.values, of.index(label), {}) for label in dict.fromkeys(of)},
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from fingerspice.circuit.devices import DEVICES
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.physics.contact import Contact, ridge_area
 from fingerspice.studies.fit.fitting import NOT_FOUND, SIGMA, FitResult, Fitted, Given, Problem, followed, measured_of
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 #: Measured columns and conditions, with their units.
 MEASURED = {"area": "m^2", "area_sliding": "m^2", "f_t": "N"}
@@ -83,8 +83,8 @@ def _relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, 
         place = "the data" if len(several) == 1 else f"data {number}"
         columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
         measured = [name for name in MEASURED if name in columns]
-        if not measured:
-            raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
+        said = f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}"
+        refuse(not measured, said)
         alone = len(measured) == 1 and SIGMA in columns
         sigmas = {name: SIGMA if alone else f"{name}_{SIGMA}" for name in measured}
         unknown = [name for name in columns if name not in (*measured, *CONDITIONS, *sigmas.values())]
@@ -93,8 +93,8 @@ def _relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, 
             allowed = ", ".join([*MEASURED, *CONDITIONS, SIGMA, *(f"{name}_{SIGMA}" for name in measured)])
             raise InputError(f"{place} have a column {unknown[0]!r}{why}; allowed: {allowed}")
         for name, x in columns.items():
-            if name != "u_gap" and not np.all(x > 0.0):
-                raise InputError(f"{place}: the smallest {name} is {x.min():g}; allowed: more than 0")
+            least = x.min(initial=math.inf)
+            refuse(name != "u_gap" and least <= 0.0, f"{place}: the smallest {name} is {least:g}; allowed: more than 0")
         none = np.zeros(columns[measured[0]].size)
         at, u, depth = columns.get("fn", none + fn), columns.get("u_gap", none), columns.get("indentation")
         if depth is not None and np.any(u != 0.0):
@@ -336,12 +336,11 @@ def fit_contact(
 
 def _gap(circuit: Circuit, finger: str | None) -> str:
     gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
-    if not gaps:
-        raise InputError("this circuit has no GAP; allowed: a circuit with a finger, whose contact is fitted")
-    if finger is None and len(gaps) > 1:
-        raise InputError(f"this circuit has several GAPs; allowed: finger= one of {', '.join(gaps.values())}")
+    several, known = finger is None and len(gaps) > 1, ", ".join(gaps.values())
+    refuse(not gaps, "this circuit has no GAP; allowed: a circuit with a finger, whose contact is fitted")
+    refuse(several, f"this circuit has several GAPs; allowed: finger= one of {known}")
     name = next(iter(gaps.values())) if finger is None else gaps.get(finger.lower(), "")
-    require(bool(name), "finger", repr(finger), f"the name of a GAP, {', '.join(gaps.values())}")
+    require(bool(name), "finger", repr(finger), f"the name of a GAP, {known}")
     fixed = circuit[name].values["a_fix"]
     require(fixed == 0.0, f"{name}.a_fix", f"{fixed:g} mm^2", "0, as a given area follows no contact")
     return name

@@ -23,6 +23,7 @@ from fingerspice.numerics.modes import AT, derivative
 from fingerspice.plots import drawing
 from fingerspice.results.outcome import SolveError
 from fingerspice.waveforms.files import read_text_columns
+from fingerspice.waveforms.waveform import refuse
 
 #: One set of measured columns, or the path of a table.
 Given = Mapping[str, ArrayLike] | str | Path
@@ -45,14 +46,13 @@ def measured_of(
         place, given = f"the data in '{Path(given)}'", _from_table(Path(given), meaning, example, by)
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
-    if by is not None and by not in given:
-        raise InputError(f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
+    missing = by is not None and by not in given
+    refuse(missing, f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
     columns = {name: real_numbers(f"data column {name!r}", x, "numbers") for name, x in given.items() if name != by}
     size = max((x.size for x in columns.values()), default=0)
     for name, x in columns.items():
-        if x.shape not in ((), (size,)):
-            said = f"data column {name!r} has the shape {x.shape}, others have {size} rows"
-            raise InputError(f"{said}; allowed: as many, or one number for all")
+        said = f"data column {name!r} has the shape {x.shape}, others have {size} rows"
+        refuse(x.shape not in ((), (size,)), f"{said}; allowed: as many, or one number for all")
         bad = np.flatnonzero(~np.isfinite(x))
         if bad.size:
             raise InputError(f"data column {name!r} is {x.flat[bad[0]]} in row {bad[0]}; allowed: finite numbers")
@@ -61,34 +61,30 @@ def measured_of(
     if by is None:
         return columns, place, {}
     cells = np.asarray(given[by])
-    if cells.ndim != 1 or cells.dtype.kind not in "iufU":
-        raise InputError(f"data column {by!r} tells the group; allowed: a text or a number for every measurement")
-    if cells.size != size:
-        raise InputError(f"data column {by!r} has {cells.size} rows, others have {size}; allowed: as many")
+    told = f"data column {by!r} tells the group; allowed: a text or a number for every measurement"
+    refuse(cells.ndim != 1 or cells.dtype.kind not in "iufU", told)
+    refuse(cells.size != size, f"data column {by!r} has {cells.size} rows, others have {size}; allowed: as many")
     return columns, place, {by: tuple(x if isinstance(x, str) else f"{x:g}" for x in cells.tolist())}
 
 
 def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> dict[str, ArrayLike]:
     table = read_text_columns(path, by)
-    if not table.names:
-        raise InputError(f"'{path}' has no header; allowed: names with units, such as {example}")
+    refuse(not table.names, f"'{path}' has no header; allowed: names with units, such as {example}")
     found, units, of_share = dict[str, Any](), dict[str, str](), dict[str, str]()
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
         if by is not None and name.lower() == by.lower():
             found[by] = [table.words[int(number)] for number in table.numbers(i)]
             continue
         key, values, base = meaning(name, table.names)
-        if key in found:
-            raise InputError(f"'{path}' has two columns {name!r}; allowed: one")
+        refuse(key in found, f"'{path}' has two columns {name!r}; allowed: one")
         if key != values and unit == "%":
             of_share[key], base = values, ""
         # The prefix of an area is squared with its unit.
-        power = 2 if base == "m^2" else 1
-        known = {prefix + base: factor**power for prefix, factor in PREFIXES.items()} if base else {"%": 0.01}
-        known |= {"": 1.0} | (dict.fromkeys(("mm2", "mm²"), 1e-6) if power == 2 else {})
-        if base is not None and unit not in known:
-            scaled = ", with k, m, u or n before it where need be" if base else ""
-            raise InputError(f"'{path}': the unit of column {name!r} is {unit!r}; allowed: {base or 'none'}{scaled}")
+        known = {"": 1.0, "mm2": 1e-6, "mm²": 1e-6} if (squared := base == "m^2") else {"": 1.0}
+        known |= {f"{x}{base}": size ** (1 + squared) for x, size in PREFIXES.items()} if base else {"%": 0.01}
+        allowed = f"{base}, with k, m, u or n before it where need be" if base else "none"
+        wrong = base is not None and unit not in known
+        refuse(wrong, f"'{path}': the unit of column {name!r} is {unit!r}; allowed: {allowed}")
         found[key], units[key] = table.numbers(i) * (1.0 if base is None else known[unit]), unit
     for key, values in of_share.items():
         # Beside values in % (a friction coefficient), a standard deviation in % is of their unit, and no share of them.
@@ -158,16 +154,16 @@ class Problem:
         self, bounds: Mapping[str, tuple[float, float]], profiles: bool | Sequence[str]
     ) -> tuple[Self, Sequence[str]]:
         """With bounds as given, and a start moved into them; and the names whose profiles are wanted, as they are."""
-        if (n := self.scale.size) < (count := len(self.paths)):
-            raise InputError(f"{n} data cannot tell {count} parameters; allowed: at least as many data")
-        lower, circuit, box = {path.lower(): tuple(pair) for path, pair in bounds.items()}, self.circuit, []
+        n, count, circuit, box = self.scale.size, len(self.paths), self.circuit, []
+        refuse(n < count, f"{n} data cannot tell {count} parameters; allowed: at least as many data")
+        given, fitted = {path.lower(): tuple(pair) for path, pair in bounds.items()}, ", ".join(self.paths)
         for path in bounds:
-            if path.lower() not in map(str.lower, self.paths):
-                raise InputError(f"bounds names {path}, which is not fitted; allowed: {', '.join(self.paths)}")
+            known = path.lower() in map(str.lower, self.paths)
+            refuse(not known, f"bounds names {path}, which is not fitted; allowed: {fitted}")
         for path in self.paths:
-            pair = lower.get(path.lower(), (0.0, math.inf))
-            if len(pair) != 2 or not 0.0 <= pair[0] < pair[1]:
-                raise InputError(f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
+            pair = given.get(path.lower(), (0.0, math.inf))
+            wrong = len(pair) != 2 or not 0.0 <= pair[0] < pair[1]
+            refuse(wrong, f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
             value = circuit.parameters[path].value
             moved = min(max(value, pair[0]), pair[1])
             if moved != value:
@@ -175,13 +171,12 @@ class Problem:
                 warnings.warn(said, FingerspiceWarning, stacklevel=3)
                 circuit = circuit.varied({path: moved})
             box.append(pair)
-        known = {name.lower(): name for name in self.names}
-        wanted = ([*known] if profiles else []) if isinstance(profiles, bool) else profiles
+        names = {name.lower(): name for name in self.names}
+        wanted = ([*names] if profiles else []) if isinstance(profiles, bool) else profiles
         for name in wanted:
-            if not isinstance(name, str) or name.lower() not in known:
-                said = f"profiles names {name!r}, which is not fitted"
-                raise InputError(f"{said}; allowed: True, or {', '.join(self.names)}")
-        return replace(self, circuit=circuit, bounds=np.array(box, float)), [known[name.lower()] for name in wanted]
+            said = f"profiles names {name!r}, which is not fitted; allowed: True, or {', '.join(self.names)}"
+            refuse(not isinstance(name, str) or name.lower() not in names, said)
+        return replace(self, circuit=circuit, bounds=np.array(box, float)), [names[name.lower()] for name in wanted]
 
 
 class Fitted(NamedTuple):

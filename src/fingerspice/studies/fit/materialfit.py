@@ -20,7 +20,7 @@ from fingerspice.netlist.reader import read_text
 from fingerspice.physics.materials import EPS0, Ladder
 from fingerspice.plots import drawing
 from fingerspice.studies.fit.fitting import PREFIXES
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 #: Columns of measured materials, and what they may be in words.
 COLUMNS = ("frequency", "resistivity", "permittivity")
@@ -95,42 +95,33 @@ def read_table(path: Path) -> FloatArray:
             if place > 0:
                 raise InputError(f"{path}, row {place + 1}: {','.join(row)!r}; allowed: three numbers") from None
             head = row
-    if any(len(row) != 3 for row in numbers):
-        raise InputError(f"{path} has rows that are not three numbers; allowed: {ALLOWED}")
-    table = np.array(numbers, float).reshape(-1, 3)
-    named, others = dict[str, FloatArray](), list[FloatArray]()
-    for name, x in zip(head if len(head) == 3 else [""] * 3, table.T, strict=True):
-        column, values = _converted(name, x, str(path))
-        if column in named:
-            names = ", ".join(head)
-            raise InputError(f"{path}: two columns are a {column} by their names, {names}; allowed: {ALLOWED}")
-        if column:
-            named[column] = values
-        else:
-            others.append(x)
+    refuse(any(len(row) != 3 for row in numbers), f"{path} has rows that are not three numbers; allowed: {ALLOWED}")
+    columns = np.array(numbers, float).reshape(-1, 3).T
+    found = [_converted(*one, path) for one in zip(head if len(head) == 3 else [""] * 3, columns, strict=True)]
+    named = [column for column, _ in found if column]
+    for column in named:
+        said = f"two columns are a {column} by their names, {', '.join(head)}; allowed: {ALLOWED}"
+        refuse(named.count(column) > 1, f"{path}: {said}")
     # Columns with unknown names fill the places that the others leave.
-    return np.column_stack([named[name] if name in named else others.pop(0) for name in COLUMNS])
+    free = (column for column in COLUMNS if column not in named)
+    table = {column or next(free): x for column, x in found}
+    return np.column_stack([table[column] for column in COLUMNS])
 
 
-def _converted(name: str, x: FloatArray, file: str) -> tuple[str, FloatArray]:
+def _converted(name: str, x: FloatArray, file: Path) -> tuple[str, FloatArray]:
     """The column that a name in a header tells, or "", and its values in SI units."""
-    match = re.fullmatch(
-        r"(?P<what>[^\[(/]*?)\s*(?:[\[(](?P<bracket>[^\])]*)[\])]|/\s*(?P<slash>.+))?", name.strip().strip("\"'")
-    )
-    what, unit = (match["what"].strip(), (match["bracket"] or match["slash"] or "").strip()) if match else ("", "")
-    if "_" in what and not unit and not any(re.fullmatch(names, what, re.IGNORECASE) for _, names, *_ in _KINDS):
-        # A name such as f_kHz ends with its unit.
-        what, _, unit = what.rpartition("_")
-    kinds = [kind for kind in _KINDS if re.fullmatch(kind[1], what, re.IGNORECASE)]
-    for column, _, units, power, factor in kinds:
-        found = re.fullmatch(units, unit)
-        if found or not unit:
-            parts = found.groupdict() if found else {}
-            metre = _METRES[parts.get("metre") or "m"] ** (-1 if "/" in unit else 1)
+    name, bare = name.strip(), name.strip().strip("\"'")
+    for column, names, units, power, factor in _KINDS:
+        # In brackets, behind a slash, or, as in f_kHz, at the name's end.
+        unit = rf"(?:(?P<open>[\[(])|[/_])\s*(?P<unit>(?:{units})?)\s*(?(open)[\])])"
+        if found := re.fullmatch(rf"(?i:{names})\s*(?:{unit})?", bare):
+            parts = found.groupdict()
+            metre = _METRES[parts.get("metre") or "m"] ** (-1 if "/" in (found["unit"] or "") else 1)
             with np.errstate(divide="ignore"):
                 return column, (_PREFIXES[parts.get("prefix") or ""] * metre * x) ** power * factor
-    of = f"{file}: the unit of column {name.strip()!r}"
-    require(not kinds, of, "not known", "Hz, rad/s, ohm m, S/m, and 1 or F/m")
+    another = r"\s*(?:[\[(][^\])]*[\])]|/.+|_[^_\[(/]*)"
+    known = any(re.fullmatch(rf"(?i:{names}){another}", bare) for _, names, *_ in _KINDS)
+    require(not known, f"{file}: the unit of column {name!r}", "not known", "Hz, rad/s, ohm m, S/m, and 1 or F/m")
     return "", x
 
 
@@ -306,8 +297,7 @@ def fit_material(
         fit.plot()
         Path("myskin.lib").write_text(fit.to_netlist("MYSKIN"))
     """
-    if poles is not None and error is not None:
-        raise InputError("poles and error are both given; allowed: one of them")
+    refuse(poles is not None and error is not None, "poles and error are both given; allowed: one of them")
     counts = range(1, MOST_POLES + 1) if poles is None else [whole_number("poles", poles, 1, MOST_POLES)]
     error = 0.02 if error is None else positive_number("error", error)
     if isinstance(data, ColeCole):
@@ -374,8 +364,7 @@ def _doubt(table: FloatArray, found: Consistency) -> str:
         said += f"; likely {' or '.join(likely)}"
     elif course:
         said += ", not by noise but along a smooth course, as of a drift or of a wrong scale of a column"
-    if found.rms > TOO_MUCH:
-        raise InputError(f"{said}; allowed: at most {100.0 * TOO_MUCH:g} %, columns of {ALLOWED}")
+    refuse(found.rms > TOO_MUCH, f"{said}; allowed: at most {100.0 * TOO_MUCH:g} %, columns of {ALLOWED}")
     warnings.warn(said, FingerspiceWarning, stacklevel=3)
     return said
 

@@ -36,8 +36,8 @@ from fingerspice.circuit.describe import digests, scenes_warnings
 from fingerspice.results.runfile import CHECKSUM, Array, attributes_of, create, tidy
 from fingerspice.studies.batch.batch import MESSAGES, STATUS_NAMES, batch, checked_scenes
 from fingerspice.studies.batch.lockstep import LOCKSTEP
-from fingerspice.studies.sweep.populations import Draws, Plan
-from fingerspice.waveforms.waveform import require
+from fingerspice.studies.sweep.populations import Plan
+from fingerspice.waveforms.waveform import refuse, require
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -95,8 +95,7 @@ class Work:
             # Of one scene.
             warnings.simplefilter("ignore", FingerspiceWarning)
             first = batch(circuit, scene, **options)
-        if "u_gap" in first:
-            raise InputError("outputs are u_gap, and a store has figures, which are one number for each scene")
+        refuse("u_gap" in first, "outputs are u_gap, and a store has figures, which are one number for each scene")
         self.block: tuple[int, ...] = ()  # Scenes of a chunk along each dimension
         for length in reversed(plan.sizes):
             size = CHUNK if first.status[0] == LOCKSTEP else SLOW_CHUNK
@@ -105,7 +104,8 @@ class Work:
         self.chunks = math.prod(self._grid)
         require(self.chunks <= MOST_CHUNKS, "the sweep", f"{math.prod(plan.sizes):,} scenes", "at most "
                 f"{MOST_CHUNKS:,} chunks of {math.prod(self.block):,}")  # fmt: skip
-        self.draws = Draws(plan, self.block[-1]) if plan.drawn else None
+        if plan.drawn:
+            plan.divide(self.block[-1])
         # With ``error`` and, as the last, ``status``
         self.outputs = {
             str(name): Array(
@@ -161,9 +161,8 @@ class Work:
             values[name] = hashlib.sha256(one.tobytes()).hexdigest() if one.size > 8 else one.tolist()
             if name in plan.names:
                 values[name] = [plan.names[name], {path: np.ravel(x).tolist() for path, x in plan.own[name].items()}]
-        for name, law in plan.drawn.items():
-            # Nine digits are the same on every machine.
-            values[name] = [f"{x:.9g}" for x in law.ppf(_PROBES)]
+        # Nine digits are the same on every machine.
+        values |= {name: [f"{x:.9g}" for x in law.ppf(_PROBES)] for name, law in plan.drawn.items()}
         # Options count alike, given or not.
         known = signature(batch).parameters.items()
         options = {name: one.default for name, one in known if one.default is not one.empty} | dict(self.options)
@@ -182,16 +181,15 @@ class Work:
         self, index: int, computing: AbstractContextManager[Any] = _FREE, writing: AbstractContextManager[Any] = _FREE
     ) -> Ran:
         """Run the scenes of a chunk within `computing`, such as a lock, and write them within `writing`."""
-        if not (self.path / "zarr.json").is_file():
-            raise InputError(f"{self.path} is not there on a worker; allowed: a folder that all machines share")
-        if programs() != self.programs:
-            raise InputError(f"a worker has {programs()}, and the sweep is of {self.programs}; allowed: the same")
+        there, own = (self.path / "zarr.json").is_file(), programs()
+        refuse(not there, f"{self.path} is not there on a worker; allowed: a folder that all machines share")
+        refuse(own != self.programs, f"a worker has {own}, and the sweep is of {self.programs}; allowed: the same")
         plan, at = self.plan, self._place(index)
         ranges = zip(at, self.block, plan.sizes, strict=True)
         part = tuple(slice(i * own, min((i + 1) * own, size)) for i, own, size in ranges)
         sizes = tuple(one.stop - one.start for one in part)
         with computing:
-            draws = {} if self.draws is None else self.draws.part(at[-1])
+            draws = plan.draws(at[-1]) if at else {}
             grid = {name: values[one] for (name, values), one in zip(plan.grid.items(), part, strict=False)}
             found = batch(plan.circuit, plan.spread(grid, draws), **self.options)
         figures = {x: found[x].values.reshape((*sizes, *one.shape[len(part) :])) for x, one in self.outputs.items()}
@@ -230,8 +228,7 @@ def stored(
 
     if workers is not None:
         whole_number("workers", workers, 1)
-        if scheduler is not None:
-            raise InputError("workers and scheduler are both given; allowed: one of them")
+        refuse(scheduler is not None, "workers and scheduler are both given; allowed: one of them")
     good = len(shard) == 2 and all(isinstance(x, int) for x in shard) and 1 <= shard[0] <= shard[1]
     require(good, "shard", shard, "two whole numbers (i, m), with i from 1 to m")
     if os.path.lexists(path):
@@ -348,18 +345,18 @@ def _lost(chunk: str, count: int, reason: Exception) -> InputError:
 
 def _run_and_write_aside(work: Work, index: int) -> Ran:
     """A task of Dask: its worker computes the next chunk while this one is written."""
+    from distributed import secede
+
     keep_freed_memory()
     if parent_process() is not None:
         # A process of Dask's own, whose terminal may be the user's, who has been warned before the first chunk.
         warnings.simplefilter("ignore", FingerspiceWarning)
-    return work.run_chunk(index, writing=_aside())
 
+    @contextmanager
+    def aside() -> Iterator[None]:
+        # What is done in here takes no thread of the worker; one task at a time, so that chunks cannot pile up.
+        with _WRITING:
+            secede()
+            yield
 
-@contextmanager
-def _aside() -> Iterator[None]:
-    """What a task does in here takes no thread of its worker; one task at a time, so that chunks cannot pile up."""
-    from distributed import secede
-
-    with _WRITING:
-        secede()
-        yield
+    return work.run_chunk(index, writing=aside())

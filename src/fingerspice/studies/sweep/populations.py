@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fingerspice import sets
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
-from fingerspice.sets.parameters import KINDS
-from fingerspice.sets.parameters import parameters as known_sets
 from fingerspice.studies.batch.batch import REFUSED, batch, own_path
 from fingerspice.waveforms.waveform import Waveform, require
 
@@ -51,18 +50,20 @@ class Plan:
         good = isinstance(asked, Mapping) and bool(asked)
         require(good, "parameters", repr(asked), "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
         self.n, self.seed = n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
+        # Draws of a part, and by each bit of its number what that adds to their bits
+        self.count, self._steps = n, list[NDArray[np.int64]]()
         power = most.bit_length() - 1
         require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
         # The paths of each name, with the value that its numbers are factors of, or the values of the sets, (n_set,)
         self.own: dict[str, Mapping[str, float | FloatArray]] = {}
         self.names: dict[str, tuple[str, ...]] = {}  # Of the sets that a name counts
         self.units: dict[str, str] = {}
-        for kind in (kind for kind in KINDS if kind in asked):
+        for kind in (kind for kind in sets.KINDS if kind in asked):
             if isinstance(asked[kind], str):
                 circuit = _applied(circuit, kind, asked[kind])[0]
             else:
                 circuit, self.names[kind], self.own[kind] = _together(circuit, kind, asked[kind])
-        rest = [name for name in asked if name in self.names or name not in KINDS]
+        rest = [name for name in asked if name in self.names or name not in sets.KINDS]
         if not rest:
             raise InputError(f"parameters is {dict(asked)!r}, and nothing varies; allowed: a list of sets, an array or "
                              "a distribution beside it")  # fmt: skip
@@ -120,43 +121,37 @@ class Plan:
         points = np.clip(points, _EDGE, 1.0 - _EDGE)
         return {path: np.asarray(law.ppf(points[:, i]), float) for i, (path, law) in enumerate(self.drawn.items())}
 
-
-class Draws:
-    """The draws of a plan in parts of `count` (a power of two, at most `n`), each of which costs the same.
-
-    The bits of a Sobol point are a linear function of those of its index: point i + j, of two indices without a common
-    bit, is the sum (exclusive or) of points i, j and 0.
-    """
-
-    def __init__(self, plan: Plan, count: int) -> None:
-        self.plan, self.count = plan, count
-        # Sums of point 0 and the points `count`, 2 `count`, ..., (n_drawn,) each.
-        starts = [count << i for i in range((plan.n // count).bit_length() - 1)]
-        self._steps = [(self._bits(start, 1) ^ self._bits(0, 1))[0] for start in starts]
+    def divide(self, count: int) -> None:
+        """Let the draws come in parts of `count` (a power of two, at most `n`), each of which costs the same."""
+        starts = [count << i for i in range((self.n // count).bit_length() - 1)]
+        self.count, self._steps = count, [self._bits(start, 1) ^ self._bits(0, 1) for start in starts]
 
     def _bits(self, start: int, count: int) -> NDArray[np.int64]:
         """Bits of so many points of the unit cube from one on, shape (count, n_drawn)."""
         from scipy.stats import qmc
 
-        engine = qmc.Sobol(len(self.plan.drawn), scramble=True, bits=BITS, rng=self.plan.seed)
+        engine = qmc.Sobol(len(self.drawn), scramble=True, bits=BITS, rng=self.seed)
         if start:
             engine.fast_forward(start)
         return np.asarray(engine.random(count) * 2.0**BITS, np.int64)
 
     @cached_property
     def _first(self) -> NDArray[np.int64]:
-        """Bits of the first part: a process that is sent the draws makes them once."""
+        """Bits of the first part: a process that is sent the plan makes them once."""
         return self._bits(0, self.count)
 
     # Two chunks may run at once, and those after them mostly have the same draws.
     @lru_cache(2)  # noqa: B019
-    def part(self, number: int) -> dict[str, FloatArray]:
-        """Values of the drawn parameters in the part with this number, shape (count,) each."""
-        bits = self._first
-        for i, step in enumerate(self._steps):
-            if number >> i & 1:
-                bits = bits ^ step
-        return self.plan.quantiles(np.asarray(bits * 2.0**-BITS, float))
+    def draws(self, number: int = 0) -> dict[str, FloatArray]:
+        """Values of the drawn parameters in the part with this number, shape (count,) each.
+
+        The bits of a Sobol point are a linear function of those of its index: point i + j, of two indices without a
+        common bit, is the sum (exclusive or) of points i, j and 0.
+        """
+        if not self.drawn:
+            return {}
+        added = (step for i, step in enumerate(self._steps) if number >> i & 1)
+        return self.quantiles(np.asarray(reduce(np.bitwise_xor, added, self._first) * 2.0**-BITS, float))
 
 
 def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, tuple[str, ...], dict[str, FloatArray]]:
@@ -180,7 +175,7 @@ def _applied(circuit: Circuit, kind: str, entry: str) -> tuple[Circuit, str, Map
     """The circuit with a set, the set's name as the sweep shows it, and the values that it gives by path."""
     to, _, name = (part.strip() for part in entry.rpartition("="))
     try:
-        one = known_sets(name, kind)
+        one = sets.parameters(name, kind)
         changed = one.apply(circuit, to or None)
     except InputError as error:
         raise InputError(f"{kind} {entry!r}: {error.message}") from None
@@ -257,7 +252,7 @@ def sweep(
     plan = Plan(circuit, parameters, n, seed, MOST_SAMPLES)
     total = math.prod(plan.sizes)
     require(total <= MOST_SCENES, "the sweep", f"{total:,} scenes", f"at most {MOST_SCENES:,}, or a store")
-    draws = Draws(plan, n).part(0) if plan.drawn else {}
+    draws = plan.draws()
     found = batch(plan.circuit, plan.spread(plan.grid, draws), **options)
     data = {
         name: ((*plan.dims, *one.dims[1:]), one.values.reshape((*plan.sizes, *one.shape[1:])), one.attrs)
