@@ -50,12 +50,6 @@ SIGNALS = {
     ),
     "v": Signal("V", "node voltage", "node", "Voltage", 2.0, of="node"),
 }
-#: Signals that follow from another one of the same gap, with its contact.
-_FOLLOWING: dict[str, tuple[str, Callable[[Contact, FloatArray], FloatArray]]] = {
-    "sigma_el": ("u_gap", Contact.stress),
-    "f_t": ("f_el", lambda contact, f: contact.mu * (contact.f_n + f)),
-    "friction": ("f_t", lambda contact, f: f / contact.f_n),
-}
 
 
 def signal_of(name: str) -> Signal:
@@ -83,10 +77,12 @@ class Sealed:
         Sealed.__post_init__(self)
 
 
-def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray:
-    """Signals (n_t,) of several elements as a table, that of one as it is."""
-    # A view of a run's rows is copied, so that it does not seal them.
-    return sealed(np.column_stack([*columns]) if len(columns) != 1 else np.array(columns[0]))
+def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray | None:
+    """Signals (n_t,) of several elements as a table, that of one as it is; None of no element."""
+    if len(columns) < 2:
+        # A view of a run's rows is copied, so that it does not seal them.
+        return sealed(np.array(columns[0])) if len(columns) else None
+    return sealed(np.column_stack([*columns]))
 
 
 class Signals(Sealed):
@@ -103,22 +99,19 @@ class Signals(Sealed):
         """Names of the GAPs."""
         return tuple(name for name, _ in self.fingers)
 
-    def value(self, key: str) -> FloatArray | None:
-        """A signal, shape (n_t,), or (n_t, n) where n elements have it; None where the run has no such signal."""
-        if SIGNALS[key].of == "gap" and key != "area" and not self.fingers:
-            return None
-        if key in _FOLLOWING and key not in vars(self):
-            base, make = _FOLLOWING[key]
-            pairs = zip(self.fingers, self.each(base), strict=True)
-            vars(self)[key] = side_by_side([make(contact, x) for (_, contact), x in pairs])
-        found: FloatArray | None = getattr(self, key, None)
-        return found
+    def _of_gaps(self, key: str, make: Callable[[Contact, FloatArray], FloatArray]) -> FloatArray | None:
+        """A signal that follows from another one of the same gap, with its contact."""
+        return side_by_side([make(own[1], x) for own, x in zip(self.fingers, self.each(key), strict=True)])
+
+    sigma_el = cached_property(lambda self: self._of_gaps("u_gap", Contact.stress))
+    f_t = cached_property(lambda self: self._of_gaps("f_el", lambda contact, f: contact.mu * (contact.f_n + f)))
+    friction = cached_property(lambda self: self._of_gaps("f_t", lambda contact, f: f / contact.f_n))
 
     def each(self, key: str) -> Sequence[FloatArray]:
         """A signal of each of its elements, shape (n_t,); none where the run has no such signal."""
         if key == "v":
             return tuple(self.node_voltages.values())
-        value = self.value(key)
+        value = getattr(self, key, None)
         return () if value is None else (value,) if value.ndim == 1 else tuple(value.T)
 
     def columns(self, key: str) -> tuple[str, ...]:
@@ -134,13 +127,10 @@ class Signals(Sealed):
         if colon:
             return (key,)
         several = tuple(f"{key}:{name}" for name in self.columns(key))
-        if key in ("u_layer", "v"):
-            return several
         # Decide without computing the signal, where possible.
-        missing = SIGNALS[key].of == "gap" and not several
-        if key in ("q_source", "i_source") or (key == "area" and missing):
-            missing = self.value(key) is None
-        return () if missing else several if len(several) > 1 else (key,)
+        if key in ("q_source", "i_source") or (SIGNALS[key].of == "gap" and not several):
+            return () if getattr(self, key, None) is None else several if len(several) > 1 else (key,)
+        return several if len(several) > 1 or key in ("u_layer", "v") else (key,)
 
     def one(self, name: str) -> FloatArray:
         """The signal of one of the `names`, shape (n_t,)."""
@@ -162,18 +152,17 @@ class StoredRecord(Signals):
         self.t, self.sources, self.fingers = t, sources, fingers
         self.node_voltages, layers = own.pop("v"), own.pop("u_layer")
         self.layers, self.u_layer = tuple(layers), np.column_stack([np.zeros((t.size, 0)), *layers.values()])
-        vars(self).update({k: side_by_side([*x.values()]) for k, x in own.items() if x and k not in _FOLLOWING})
+        vars(self).update({key: side_by_side([*x.values()]) for key, x in own.items() if x})
         self.__post_init__()
 
 
-def attribute(get: Callable[[Any], Any], doc: str) -> Any:
-    """A property of a result, with its documentation."""
-    return property(get, doc=doc)
+#: A property of a result, with its documentation.
+attribute: Callable[..., Any] = property
 
 
 def _given(key: str, doc: str) -> Any:
-    """A property: a signal, None where the run has no such signal; or what else its record has."""
-    return attribute(lambda r: r.record.value(key) if key in SIGNALS else getattr(r.record, key), doc)
+    """A property: what the record has of this name, None where the run has no such signal."""
+    return attribute(lambda result: getattr(result.record, key, None), doc=doc)
 
 
 class Signalled:
@@ -264,8 +253,7 @@ def variables(
         about = {"units": signal.unit, "long_name": signal.text}
         if len(columns) > 1 or key in ("u_layer", "v"):
             coords[signal.of] = ((signal.of,), np.array(solution.record.columns(key), dtype=object), {})
-            table = np.column_stack([np.zeros((int(keep.sum()), 0)), *columns])
-            data[key] = (("time", signal.of), table, about)
+            data[key] = (("time", signal.of), np.column_stack([np.zeros((int(keep.sum()), 0)), *columns]), about)
         elif columns:
             data[key] = (("time",), columns[0], about)
     return data, coords
@@ -338,7 +326,7 @@ class Record(Signals):
         return areas(self.cell_voltage(int(self.net.gap[i])), self.net.curves[i])
 
     @cached_property
-    def u_source(self) -> FloatArray:
+    def u_source(self) -> FloatArray | None:
         """Voltage of each source, V: from p to n of a V, and from n to p of an I, the direction in which it drives."""
         out, zero = list(self._s.T[: len(self.network.sources)]), np.zeros(self.t.size)
         for j, element in enumerate(self.network.sources[self.network.n_voltage :], self.network.n_voltage):
@@ -355,18 +343,17 @@ class Record(Signals):
         return sealed(np.einsum("tc,lc->tl", table, self.network.grouping))
 
     @cached_property
-    def u_gap(self) -> FloatArray:
+    def u_gap(self) -> FloatArray | None:
         """Gap voltage, V."""
         return side_by_side([self.cell_voltage(gap) for gap in self.network.gaps if gap is not None])
 
     @cached_property
     def area(self) -> FloatArray | None:
         """Contact area of each GAP, m^2; without a GAP the circuit's first area; None where there is none."""
-        shown = self.network.fingers or ((0,) if self.network.areas else ())
-        return side_by_side([self._area_of(i) for i in shown]) if shown else None
+        return side_by_side([self._area_of(i) for i in self.network.fingers or range(min(1, len(self.network.areas)))])
 
     @cached_property
-    def f_el(self) -> FloatArray:
+    def f_el(self) -> FloatArray | None:
         """Electroadhesive force (Eq. 2 times A_R), N."""
         out = []
         for i, (_, contact), u in zip(self.network.fingers, self.fingers, self.each("u_gap"), strict=True):

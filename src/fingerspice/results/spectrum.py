@@ -374,6 +374,5 @@ def phasor_tables(results: Sequence[PhasorSolution], circuit: Circuit) -> str:
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     """Write sweeps as CSV, one after the other where there are several amplitudes."""
     tables = [r._columns() for r in results]
-    header = [f"{column.key} [{column.unit}]" for column in tables[0]]
     rows = (row for columns in tables for row in zip(*(c.values.tolist() for c in columns), strict=True))
-    return write_csv(path, header, rows)
+    return write_csv(path, [f"{column.key} [{column.unit}]" for column in tables[0]], rows)

@@ -131,11 +131,9 @@ class Figures:
     @cached_property
     def shown(self) -> tuple[str, ...]:
         """Names of the signals in the summary: of gaps, or else of all layers, or else of all nodes."""
-        names = self.signals.names
-        if self.signals.gaps:
-            keys = ("u_source", "u_gap", "area", "f_el", "f_t", "friction")
-            return tuple(name for key in keys for name in names(key))
-        return (*names("u_source"), *(names("u_layer") or names("v")), *names("area"))
+        of_gaps = ("u_gap", "area", "f_el", "f_t", "friction")
+        keys = of_gaps if self.signals.gaps else ("u_layer" if self.signals.layers else "v", "area")
+        return tuple(name for key in ("u_source", *keys) for name in self.signals.names(key))
 
     def summary(self) -> dict[str, Any]:
         """As `Solution.summary` says."""
@@ -209,7 +207,7 @@ def _row(name: str, s: dict[str, Any]) -> tuple[str, ...]:
 
 def figure(key: str, kind: str, doc: str) -> Value:
     """A property of a result that has `_figures`: a figure of a signal."""
-    return attribute(lambda result: result._figures.value(key, kind), doc)  # type: ignore[no-any-return]
+    return attribute(lambda result: result._figures.value(key, kind), doc=doc)  # type: ignore[no-any-return]
 
 
 class Figured:
