@@ -17,7 +17,6 @@ from typer import Argument, Option
 
 import fingerspice as fs
 from fingerspice.base.announcing import paced
-from fingerspice.base.arrays import positive_row
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.cli import studies, terminal
@@ -159,9 +158,10 @@ def ac(
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
     from fingerspice.circuit.circuit import AcSweep
+    from fingerspice.circuit.describe import heading
     from fingerspice.netlist.netlist import sweep_from_text
     from fingerspice.plots.traces import plot_phasor
-    from fingerspice.results.spectrum import phasor_csv, phasor_tables
+    from fingerspice.results.spectrum import phasor_csv
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.steady import sweep_frequencies
 
@@ -177,15 +177,12 @@ def ac(
     except InputError as error:
         raise InputError(f"--sweep {error.message}") from None
     frequencies = sweep_frequencies(line)
-    found: tuple[Any, ...] = ()
-    if coupled:
-        if skin != "swept":
-            raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-        if amplitude:
-            positive_row("amplitude", amplitude, "V")
-    elif amplitude:
+    if coupled and skin != "swept":
+        raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
+    if amplitude and not coupled:
         raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
-    else:
+    found: tuple[Any, ...] = ()
+    if not coupled:
         found = (fs.phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
     job.check_files(circuit, "_ac.csv", "_ac.png")
     if coupled:
@@ -196,7 +193,7 @@ def ac(
             )  # fmt: skip
     job.answer.update(sweeps=[r.to_dict() for r in found] if job.json else None)
     makes: Makes = {"_ac.csv": partial(phasor_csv, found), "_ac.png": partial(plot_phasor, found, circuit)}
-    job.give(lambda: phasor_tables(found, circuit), makes)
+    job.give(lambda: "\n\n".join([heading(circuit), *(one._page(40) for one in found)]), makes)
 
 
 def plan(

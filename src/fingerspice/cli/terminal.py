@@ -69,8 +69,7 @@ def of_run(solution: fs.Solution) -> dict[str, Any]:
     }  # fmt: skip
 
 
-#: Largest number of characters of a printed line; the middle of a longer line is left out.
-LONGEST_LINE = 2000
+LONGEST_LINE = 2000  # Largest number of characters of a printed line; the middle of a longer line is left out.
 
 
 def say(text: str = "", end: str = "\n") -> None:

@@ -156,8 +156,7 @@ class StoredRecord(Signals):
         self.__post_init__()
 
 
-#: A property of a result, with its documentation.
-attribute: Callable[..., Any] = property
+attribute: Callable[..., Any] = property  # A property of a result, with its documentation.
 
 
 def _given(key: str, doc: str) -> Any:

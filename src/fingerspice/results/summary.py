@@ -38,13 +38,12 @@ class Figures:
 
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
-        self.signals = solution.record
         self._kept: dict[str, Any] = dict(solution.stored or {})
         self._extremes: dict[tuple[str, bool], tuple[float, float]] = {}
 
     def value(self, key: str, kind: str) -> Value:
         """A figure of a kind that `_made` knows: a number, an array of several gaps or sources, or None."""
-        values = [self._one(name, kind) for name in self.signals.names(key)]
+        values = [self._one(name, kind) for name in self.solution.record.names(key)]
         if len(values) < 2:
             return values[0] if values else None
         return None if None in values else sealed(np.array(values, float))
@@ -117,7 +116,7 @@ class Figures:
 
         None where the run is not known between its outputs, or the table is larger than `MOST_BETWEEN`.
         """
-        names = [name for key in _BETWEEN for name in self.signals.names(key)]
+        names = [name for key in _BETWEEN for name in self.solution.record.names(key)]
         if not isinstance(self.last, Stretch) or self.last.panels.shape[1] * NODES * len(names) > MOST_BETWEEN:
             return None
         t, *columns = self.last.at_nodes(names, _MISSED)
@@ -132,8 +131,8 @@ class Figures:
     def shown(self) -> tuple[str, ...]:
         """Names of the signals in the summary: of gaps, or else of all layers, or else of all nodes."""
         of_gaps = ("u_gap", "area", "f_el", "f_t", "friction")
-        keys = of_gaps if self.signals.gaps else ("u_layer" if self.signals.layers else "v", "area")
-        return tuple(name for key in ("u_source", *keys) for name in self.signals.names(key))
+        keys = of_gaps if self.solution.record.gaps else ("u_layer" if self.solution.record.layers else "v", "area")
+        return tuple(name for key in ("u_source", *keys) for name in self.solution.record.names(key))
 
     def summary(self) -> dict[str, Any]:
         """As `Solution.summary` says."""
@@ -153,7 +152,7 @@ class Figures:
             for name in (name for name in ("u_source", "u_gap") if name in self.shown):
                 out |= {f"{name}_{kind}": one(name, kind) for kind in ("amplitude", "phase_deg")}
             out["fundamental"] = s.fundamental.frequency
-        if self.signals.gaps:
+        if self.solution.record.gaps:
             out["fold_margin_min"] = min(s.fold_margin_min, float(s.fold_margin.min(initial=1.0)))
         return out
 
@@ -164,7 +163,7 @@ class Figures:
         how = f"charge law {run.charge_law}, area {run.area_mode}, method {run.method}, rtol {run.rtol:g}"
         out: list[str | Table] = [*head_lines(run.circuit), f"{end} simulated; {how}", ""]
         if run.t.size >= 2:
-            names = [name for key in _ROWS for name in self.signals.names(key) if f"{name}_max" in s]
+            names = [name for key in _ROWS for name in self.solution.record.names(key) if f"{name}_max" in s]
             out.append(Table(("", *_COLUMNS), [_row(name, s) for name in names]))
             if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
                 out += ["last period: the mean over it; rms and ripple (max - min) are those of the last period, too"]
