@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, read_only
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.network import Network
 from fingerspice.engine.network import Net
@@ -57,12 +57,6 @@ def signal_of(name: str) -> Signal:
     return SIGNALS[name.partition(":")[0]]
 
 
-def sealed(x: FloatArray) -> FloatArray:
-    """The same array, read-only."""
-    x.flags.writeable = False
-    return x
-
-
 class Sealed:
     """A result whose arrays are read-only, also after copying or unpickling, which both make writable arrays."""
 
@@ -70,7 +64,7 @@ class Sealed:
         for value in vars(self).values():
             for array in value.values() if isinstance(value, dict) else (value,):
                 if isinstance(array, np.ndarray):
-                    sealed(array)
+                    array.flags.writeable = False
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -81,8 +75,8 @@ def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray | Non
     """Signals (n_t,) of several elements as a table, that of one as it is; None of no element."""
     if len(columns) < 2:
         # A view of a run's rows is copied, so that it does not seal them.
-        return sealed(np.array(columns[0])) if len(columns) else None
-    return sealed(np.column_stack([*columns]))
+        return read_only(np.array(columns[0])) if len(columns) else None
+    return read_only(np.column_stack([*columns]))
 
 
 class Signals(Sealed):
@@ -266,7 +260,7 @@ def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
     if (lost := ~np.isfinite(out)).any():
         # A run ends where the source stops being finite, at a time known to 1e-12: use the finite value just before.
         out[lost] = waveform.value(t[lost] * (1.0 - 4e-12))
-    return sealed(out)
+    return read_only(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +333,7 @@ class Record(Signals):
         """Layer voltages from p to n, V, shape (n_t, n_layer)."""
         cells = map(self.cell_voltage, range(len(self.network.cells)))
         table = np.column_stack([np.zeros((self.t.size, 0)), *cells])
-        return sealed(np.einsum("tc,lc->tl", table, self.network.grouping))
+        return read_only(np.einsum("tc,lc->tl", table, self.network.grouping))
 
     @cached_property
     def u_gap(self) -> FloatArray | None:
@@ -383,7 +377,7 @@ class Record(Signals):
         net, n = self.net, self._x.shape[1]
         out = np.ones(self.t.size)
         if not net.mobile or not np.any((net.gap >= 0) & (net.slow < 0)):
-            return sealed(out)
+            return read_only(out)
         area = np.column_stack([self._area_of(i) for i in range(net.gap.size)])
         held, met = np.zeros((2, self.t.size, n, n))
         for cell in range(net.c.size):
@@ -395,11 +389,11 @@ class Record(Signals):
                 inverse, slope = inverse_area_array(np.abs(u), net.curves[i])
                 cross = net.c[cell] * self.cell_voltage(cell) * -np.sign(u) * slope / inverse**2
                 met += cross[:, None, None] * np.outer(row, net.p[net.gap[i]])
-        return sealed(np.linalg.det(held + met) / np.linalg.det(held))
+        return read_only(np.linalg.det(held + met) / np.linalg.det(held))
 
     @cached_property
     def node_voltages(self) -> dict[str, FloatArray]:  # type: ignore[override]
         """Voltage of every node against ground, V, shape (n_t,) each."""
         n = self._x.shape[1]
         rows = zip(self.network.node_names, self.network.nodes, strict=True)
-        return {name: sealed(self._voltage(row[:n], row[n:])) for name, row in rows}
+        return {name: read_only(self._voltage(row[:n], row[n:])) for name, row in rows}

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, read_only
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
 from fingerspice.numerics.lobatto import NODES
-from fingerspice.results.record import attribute, sealed, signal_of
+from fingerspice.results.record import attribute, signal_of
 from fingerspice.results.steps import Outputs, Stretch
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Figures:
         values = [self._one(name, kind) for name in self.solution.record.names(key)]
         if len(values) < 2:
             return values[0] if values else None
-        return None if None in values else sealed(np.array(values, float))
+        return None if None in values else read_only(np.array(values, float))
 
     def _one(self, name: str, kind: str) -> float | None:
         key = f"{name}_{kind}"
