@@ -58,10 +58,10 @@ def of_run(solution: fs.Solution) -> dict[str, Any]:
     s, rows = solution.summary(), []
     for name in [key.removesuffix("_peak") for key in s if key.endswith("_peak")]:
         signal, _, element = name.partition(":")
-        if not element and signal in ("u_gap", "area", "f_el", "f_t", "friction") and len(solution.gaps) == 1:
+        if not element and SIGNALS[signal].of == "gap" and len(solution.gaps) == 1:
             element = solution.gaps[0]
         figures = {figure: s.get(f"{name}_{figure}") for figure in FIGURES}
-        rows.append({"signal": signal, "element": element or None, "unit": SIGNALS[signal][0], **figures})
+        rows.append({"signal": signal, "element": element or None, "unit": SIGNALS[signal].unit, **figures})
     return {
         "charge_law": solution.charge_law, "method": solution.method, "area": solution.area_mode,
         "tier": solution.plan.tier, "error": vars(solution.error), "signals": rows, "t_stop": s["t_stop"],

@@ -240,7 +240,7 @@ class ClosedForm:
         count = np.maximum(np.ceil(np.diff(edges) / longest), 1.0).astype(int)
         if count.sum() > MOST_PANELS:
             return None
-        return np.interp(np.arange(count.sum() + 1), np.append(0, np.cumsum(count)), edges)
+        return np.asarray(np.interp(np.arange(count.sum() + 1), np.append(0, np.cumsum(count)), edges))
 
     def _at_points(self, begin: FloatArray, end: FloatArray) -> tuple[Record, IntArray]:
         """The record at the points of all panels, and the row of each, shape (p, ROWS)."""
