@@ -166,17 +166,12 @@ class Signalled:
 
     layers: tuple[str, ...] = _given("layers", "Names of the columns of `u_layer`.")
     gaps: tuple[str, ...] = _given("gaps", "Names of the GAPs.")
-    sources: tuple[str, ...] = _given(
-        "sources", "Names of the sources of a network; of a series stack there is one, its loop."
-    )
+    sources: tuple[str, ...] = _given("sources", "Names of the sources; of a series stack there is one, its loop.")
     node_voltages: dict[str, FloatArray] = _given("node_voltages", "Node name to its voltage, V, shape (n_t,).")
-    u_source: FloatArray = _given(
-        "u_source", "Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,)."
-    )
+    u_source: FloatArray = _given("u_source", "Voltage of each source, V, shape (n_t,); of a series stack the loop's.")
     u_layer: FloatArray = _given("u_layer", "Voltage of each layer from its p to its n node, V, shape (n_t, n_layer).")
     fold_margin: FloatArray = _given(
-        "fold_margin",
-        "Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`.",
+        "fold_margin", "Distance to the fold of the `mobile` law: 1 without stored charge and under `local`, 0 at it."
     )
     area: FloatArray | None = _given("area", "Ridge contact area, m^2, shape (n_t,); None for a circuit without any.")
     q_source: FloatArray | None = _given(
@@ -185,8 +180,7 @@ class Signalled:
         "None where the run was asked to leave it out.",
     )
     i_source: FloatArray | None = _given(
-        "i_source",
-        "Current of the source, A, shape (n_t,), without the impulses at jumps, which only `q_source` shows.",
+        "i_source", "Current of the source, A, shape (n_t,), without the impulses at jumps, which `q_source` has."
     )
     u_gap: FloatArray | None = _given("u_gap", "Gap voltage, V, shape (n_t,); None for a circuit without GAP.")
     sigma_el: FloatArray | None = _given(

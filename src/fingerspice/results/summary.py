@@ -217,9 +217,8 @@ class Figured:
 
     f_el_mean = figure("f_el", "mean", "Mean electroadhesive force over the run, N.")
     f_el_mean_periodic = figure(
-        "f_el", "mean_periodic",
-        "Mean electroadhesive force over the source's last period, N; None where the run holds none.",
-    )  # fmt: skip
+        "f_el", "mean_periodic", "Mean electroadhesive force over the source's last period, N; None without one."
+    )
     f_el_peak = figure("f_el", "peak", "Largest electroadhesive force, N.")
     f_t_mean = figure("f_t", "mean", "Mean friction force over the run, N.")
     f_t_mean_periodic = figure(
@@ -234,6 +233,5 @@ class Figured:
         "Amplitude of the gap voltage at the source's fundamental, over its last period, V; None without one.",
     )  # fmt: skip
     u_gap_phase_deg = figure(
-        "u_gap", "phase_deg",
-        "Phase of the gap voltage at the source's fundamental, relative to a sine, degrees.",
-    )  # fmt: skip
+        "u_gap", "phase_deg", "Phase of the gap voltage at the source's fundamental, relative to a sine, degrees."
+    )
