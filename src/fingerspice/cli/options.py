@@ -170,7 +170,7 @@ class Job:
         written: list[str] = self.answer["files"]
         try:
             for end, file in self.files.items():
-                if file.suffix != ".png":
+                if not end.endswith(".png"):
                     makes[end](file)
                 elif (picture := makes[end]()) is None:
                     continue
