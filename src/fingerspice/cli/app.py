@@ -17,6 +17,7 @@ from typer import Argument, Option
 
 import fingerspice as fs
 from fingerspice.base.announcing import paced
+from fingerspice.base.arrays import positive_row
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.cli import studies, terminal
@@ -179,8 +180,10 @@ def ac(
     frequencies = sweep_frequencies(line)
     if coupled and skin != "swept":
         raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-    if amplitude and not coupled:
-        raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
+    if amplitude:
+        if not coupled:
+            raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
+        positive_row("amplitude", amplitude, "V")
     found: tuple[Any, ...] = ()
     if not coupled:
         found = (fs.phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
