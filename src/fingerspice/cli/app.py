@@ -21,17 +21,7 @@ from fingerspice.base.arrays import positive_row
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.cli import studies, terminal
-from fingerspice.cli.options import (
-    FOLDER,
-    SETS,
-    Job,
-    Makes,
-    Results,
-    add_command,
-    area_from_text,
-    check_output,
-    with_times,
-)
+from fingerspice.cli.options import FOLDER, SETS, Job, Makes, add_command, area_from_text, check_output, with_times
 from fingerspice.cli.terminal import complain, outcome, say
 from fingerspice.waveforms.waveform import require
 
@@ -122,7 +112,7 @@ def run(
     if feel and not circuit.by_device("GAP"):
         raise InputError("--feel: the circuit has no GAP, so there is no friction to feel")
     more = [end for end, on in (("_schematic.svg", schematic), ("_feel.png", feel)) if on]
-    results = Results(job, circuit, ".csv" if csv else ".nc", ".png", *more)
+    job.check_files(circuit, ".csv" if csv else ".nc", ".png", *more)
     with paced("simulating") as update:
         solution = simulate(circuit, **how, jumps=jumps, throw=False, progress=update)
     if job.json:
@@ -139,12 +129,12 @@ def run(
         ".csv": solution.to_csv, ".nc": solution.to_netcdf,
         ".png": lambda: put_beside(solution.plot(), circuit) if schematic else solution.plot(),
         # An SVG file knows no names of our own, and keeps all of them as one text.
-        "_schematic.svg": lambda file: circuit.draw().write(file, {"Description": json.dumps(results.about)}),
+        "_schematic.svg": lambda file: circuit.draw().write(file, {"Description": json.dumps(job.about)}),
         "_feel.png": lambda: fingers[0].plot(fingers[1:]) if fingers else None,
     }  # fmt: skip
     if not solution.t.size:
-        results.files.clear()
-    results.give(lambda: "\n\n".join([solution._page(), *map(str, fingers)]), makes)
+        job.files.clear()
+    job.give(lambda: "\n\n".join([solution._page(), *map(str, fingers)]), makes)
     if solution.failure is not None:
         raise fs.SolveError(solution.failure, solution)
     if unfelt is not None:
@@ -169,9 +159,10 @@ def ac(
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
     from fingerspice.circuit.circuit import AcSweep
+    from fingerspice.circuit.describe import heading
     from fingerspice.netlist.netlist import sweep_from_text
     from fingerspice.plots.traces import plot_phasor
-    from fingerspice.results.spectrum import phasor_csv, phasor_tables
+    from fingerspice.results.spectrum import phasor_csv
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.steady import sweep_frequencies
 
@@ -187,17 +178,16 @@ def ac(
     except InputError as error:
         raise InputError(f"--sweep {error.message}") from None
     frequencies = sweep_frequencies(line)
+    if coupled and skin != "swept":
+        raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
+    if amplitude:
+        if not coupled:
+            raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
+        positive_row("amplitude", amplitude, "V")
     found: tuple[Any, ...] = ()
-    if coupled:
-        if skin != "swept":
-            raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-        if amplitude:
-            positive_row("amplitude", amplitude, "V")
-    elif amplitude:
-        raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
-    else:
+    if not coupled:
         found = (fs.phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
-    results = Results(job, circuit, "_ac.csv", "_ac.png")
+    job.check_files(circuit, "_ac.csv", "_ac.png")
     if coupled:
         with paced("sweeping") as update:
             found = fs.large_signal(
@@ -206,7 +196,7 @@ def ac(
             )  # fmt: skip
     job.answer.update(sweeps=[r.to_dict() for r in found] if job.json else None)
     makes: Makes = {"_ac.csv": partial(phasor_csv, found), "_ac.png": partial(plot_phasor, found, circuit)}
-    results.give(lambda: phasor_tables(found, circuit), makes)
+    job.give(lambda: "\n\n".join([heading(circuit), *(one._page(40) for one in found)]), makes)
 
 
 def plan(
@@ -227,7 +217,7 @@ def plan(
     found = result.to_dict()
     job.answer.update(**{key: found[key] for key in terminal.OWN["plan"] if key in found and key != "area"})
     job.answer.update(plan_area=result.area)
-    job.answer.give(lambda: "\n".join([*head_lines(circuit), "", str(result)]))
+    job.give(lambda: "\n".join([*head_lines(circuit), "", str(result)]))
 
 
 def compare(job: Job) -> None:
@@ -241,10 +231,10 @@ def compare(job: Job) -> None:
 
     circuit = job.read()
     check_arguments(job.rtol)
-    results = Results(job, circuit, "_compare.png")
+    job.check_files(circuit, "_compare.png")
     result = fs.compare(circuit, charge_law=job.charge_law, rtol=job.rtol)
     job.answer.update(method=result.solution.method, **result.to_dict())
-    results.give(lambda: str(result), {"_compare.png": result.plot})
+    job.give(lambda: str(result), {"_compare.png": result.plot})
 
 
 def export(
@@ -258,12 +248,12 @@ def export(
     """
     circuit, _ = with_times(job.read(), job.stop)
     check_output(output, job.deck)
-    text = fs.export_netlist(circuit, charge_law=job.charge_law)
-    job.answer.give(str, [partial(_write_text, output, text)])
+    _give_file(job, output, fs.export_netlist(circuit, charge_law=job.charge_law))
 
 
-def _write_text(file: Path, text: str) -> Path:
-    return write_aside(file, lambda path: path.write_text(text, encoding="utf-8"))
+def _give_file(job: Job, file: Path, text: str) -> None:
+    job.files = {"": file}
+    job.give(str, {"": lambda file: write_aside(file, lambda path: path.write_text(text, encoding="utf-8"))})
 
 
 def explore(
@@ -292,13 +282,13 @@ def explore(
         from fingerspice.explorer.server import static_page
 
         check_output(static, deck)
-        job.answer.give(str, [partial(_write_text, static, static_page(circuit))])
+        _give_file(job, static, static_page(circuit))
         return None
     explorer, ended = fs.Explorer(circuit, port), list[int]()
     job.answer.update(url=explorer.url)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: ended.append(number))
-    job.answer.give(lambda: f"the explorer is at {explorer.url}\nCtrl-C ends it")
+    job.give(lambda: f"the explorer is at {explorer.url}\nCtrl-C ends it")
 
     def serve() -> None:
         if not no_browser:
@@ -338,7 +328,8 @@ def figures(
         for i, (file, one) in enumerate(drawn.items(), 1):
             draw(one, file)
             update(i / len(drawn))
-    job.answer.give(str, [partial(Path, file) for file in files])
+    job.answer.update(files=[*map(str, files)])
+    job.give(str)
 
 
 def sets(
@@ -354,7 +345,7 @@ def sets(
     found = fs.parameters() if name is None else fs.parameters(name)
     shown = fs.parameters().values() if name is None else [fs.parameters(name)]
     job.answer.update(parameter_sets=[one.to_dict() for one in shown])
-    job.answer.give(lambda: str(found))
+    job.give(lambda: str(found))
 
 
 def check(
@@ -370,8 +361,7 @@ def check(
 
     chunks = check_store(store)
     job.answer.update(chunks=chunks)
-    said = f"{store}: {sum(chunks.values()):,} chunks of {len(chunks)} arrays are as they were written"
-    job.answer.give(lambda: said)
+    job.give(lambda: f"{store}: {sum(chunks.values()):,} chunks of {len(chunks)} arrays are as they were written")
 
 
 _FILES = "deck out name overwrite"

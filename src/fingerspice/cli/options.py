@@ -13,9 +13,9 @@ import tempfile
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, get_args
 
 import typer
@@ -25,33 +25,36 @@ import fingerspice as fs
 from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.base.files import write_aside
 from fingerspice.base.units import parse_number
-from fingerspice.cli.terminal import Answering, complain
+from fingerspice.cli.terminal import blank, complain, outcome, say, say_json
+from fingerspice.results.outcome import SolveError
 from fingerspice.waveforms.waveform import require
 
-#: Largest area that causes no warning, m^2; a larger one was probably given in mm^2.
-LARGEST_AREA = 0.01
-#: Largest number of characters of a source's numbers that are stored with the results.
-LONGEST_SOURCE = 1000
-#: Folder of the results unless another one is named.
-FOLDER = Path("out")
+LARGEST_AREA = 0.01  # Largest area that causes no warning, m^2; a larger one was probably given in mm^2
+LONGEST_SOURCE = 1000  # Largest number of characters of a source's numbers that are stored with the results
+FOLDER = Path("out")  # Folder of the results unless another one is named
 #: First bytes of the tables that the commands write.
 _HEADS = (
     b"t [s],u_source", b"frequency [Hz],gain [1],", b"parameter,value [SI],unit,", b"time (s),drive (V)",
     b"time (s),wanted force (N),",
 )  # fmt: skip
-
-
-#: Options that name sets of parameters.
-SETS = ("set", "finger", "coating", "drive")
+SETS = ("set", "finger", "coating", "drive")  # Options that name sets of parameters
 _SET = "Apply a named set of this kind: {} (list: fingerspice sets)."
 _SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
 
 
+#: What makes the files of a job, by their endings: it draws a picture or gives None; else it is given the path.
+Makes = Mapping[str, Callable[..., Any]]
+
+
 @dataclass
 class Job:
-    """One call of a command: the options that commands share, with the defaults of those that it does not take."""
+    """One call of a command: the options that commands share, with the defaults of those that it does not take.
 
-    answer: Answering
+    Each warning that is given inside becomes one line on stderr and a part of the answer. If JSON is wanted, the answer
+    is printed at the end, even if that is an error.
+    """
+
+    answer: dict[str, Any]
     deck: Annotated[Path, Argument(metavar="DECK", help="Netlist file (.cir), - for standard input.")]
     out: Annotated[Path | None, "Folder of the files; out by default.", "FOLDER"] = None
     name: Annotated[str | None, "Name of the files; that of the deck by default.", "NAME"] = None
@@ -68,6 +71,32 @@ class Job:
     stop: Annotated[str | None, "End of the run, s: 50m; TSTOP by default.", "TIME"] = None
     json: Annotated[bool, "Print JSON (docs/json.md), nothing else on stdout."] = False
     no_plot: Annotated[bool, "Write no picture."] = False
+    files: dict[str, Path] = field(default_factory=dict, init=False)  # Files of the results by their endings
+    about: dict[str, str] = field(default_factory=dict, init=False)  # Texts kept in a picture
+
+    def __enter__(self) -> Job:
+        self._warnings = warnings.catch_warnings(action="always", category=FingerspiceWarning)
+        self._warnings.__enter__()
+        warnings.showwarning = self._show
+        return self
+
+    def _show(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        text = str(message)
+        if text not in self.answer["warnings"]:
+            self.answer["warnings"].append(text)
+            complain(f"warning: {text}")
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: Any) -> None:
+        self._warnings.__exit__(kind, error, None)
+        if not self.json or not (error is None or isinstance(error, Exception)):
+            return
+        if error is None:
+            self.answer.update(success=True, status="SUCCESS", message="success")
+        else:
+            _, status, said = outcome(error)
+            failure = error.failure.to_dict() if isinstance(error, SolveError) else None
+            self.answer.update(status=status, message=said, failure=failure)
+        say_json(self.answer)
 
     def read(self) -> fs.Circuit:
         """The circuit that the options ask for, of which the answer tells.
@@ -107,6 +136,85 @@ class Job:
         self.answer.update(**known, charge_law=law)
         return circuit
 
+    def check_files(self, circuit: fs.Circuit, *ends: str) -> Path:
+        """The path of the results without its end, of which files with these ends are checked before anything is run.
+
+        They go into the folder `out` under the deck's name, or the one given; with `overwrite` they may replace files
+        of other or unknown circuits.
+        """
+        name, allowed = self.name, "a file's name without folder and end; --out names the folder"
+        plain = name is None or (name not in ("", ".", "..") and Path(name).name == name and name.isprintable())
+        require(plain, "--name", repr(name), allowed)
+        path = (self.out or FOLDER) / (name or (circuit.path or self.deck).stem)
+        wanted = [end for end in ends if not (self.no_plot and end.endswith(".png"))]
+        self.files = {end: path.with_name(f"{path.name}{end}") for end in wanted}
+        self.about = {
+            "program": "fingerspice", "title": circuit.title, "file": str(circuit.path or ""),
+            "deck_sha256": _hash(circuit.text), "overrides": json.dumps(dict(circuit.overrides)),
+            "charge_law": self.charge_law or circuit.charge_law or "local",
+            "files": json.dumps([file.name for file in self.files.values()]),
+        }  # fmt: skip
+        earlier = False
+        for file in self.files.values():
+            check_output(file, self.deck)
+            if file.is_file() and not self.overwrite:
+                earlier |= self._of_earlier_text(file)
+        if earlier:
+            complain(f"note: the results in {path.parent} are of an earlier text of {self.deck} and are replaced")
+        return path
+
+    def give(self, text: Callable[[], str], makes: Makes = MappingProxyType({})) -> None:
+        """Write the files, then print a text unless JSON is wanted, even if a file cannot be written."""
+        if self.about and self.files:
+            self.make_folder()
+        written: list[str] = self.answer["files"]
+        try:
+            for end, file in self.files.items():
+                if not end.endswith(".png"):
+                    makes[end](file)
+                elif (picture := makes[end]()) is None:
+                    continue
+                else:
+                    from fingerspice.plots.drawing import save
+
+                    save(picture, file, about=self.about)
+                written.append(str(file))
+        finally:
+            said = [*filter(None, [text()]), *(f"wrote {file}" for file in written)]
+            if said and not self.json:
+                say("\n".join(said))
+
+    def make_folder(self) -> None:
+        """When the default folder is created, put a .gitignore into it, to keep results out of version control."""
+        if self.out is None and not FOLDER.exists():
+            # Ignore an error: writing the results will then fail as well, with a message.
+            with suppress(InputError):
+                write_aside(FOLDER / ".gitignore", lambda path: path.write_text("*\n"))
+
+    def _of_earlier_text(self, file: Path) -> bool:
+        """Whether a file is of an earlier text of the deck; refused is one of another circuit, or an unknown one."""
+        ways = "allowed: --name NAME, another --out, or --overwrite"
+        try:
+            held, own = _texts_in(file), self.about
+            changes = [dict(json.loads(one["overrides"])) for one in (held, own)]
+            same_deck, same_law = (held[key] == own[key] for key in ("deck_sha256", "charge_law"))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, SyntaxError):
+            # The file was not written by this package, or is a table; beside a WAV file there is such a table.
+            with suppress(OSError), (file.with_suffix(".csv") if file.suffix == ".wav" else file).open("rb") as stream:
+                if stream.read(100).startswith(_HEADS):
+                    complain(f"note: {file} is replaced; a table alone does not say which circuit it is of")
+                    return False
+            raise InputError(f"{file} is there already, and nothing says which circuit it is of; {ways}") from None
+        if changes[0] != changes[1]:
+            said = [_with(one) for one in changes]
+        elif not same_law:
+            said = [f"under the {one['charge_law']} law" for one in (held, own)]
+        elif not same_deck and (held.get("file", "") != own["file"] or not held.get("file")):
+            said = [f"of the deck {held.get('file') or 'of another text'}", f"of {self.deck}"]
+        else:
+            return not same_deck
+        raise InputError(f"{file} holds a result {said[0]}, and this one is {said[1]}; {ways}")
+
 
 def add_command(app: typer.Typer, options: str, function: Callable[..., Callable[[], None] | None]) -> None:
     """Make a function of a `Job` and of options of its own a command, whose help has all options in this order.
@@ -118,9 +226,9 @@ def add_command(app: typer.Typer, options: str, function: Callable[..., Callable
     known = {**inspect.signature(Job, eval_str=True).parameters, **own}
 
     def call(**given: Any) -> None:
-        with Answering(name, **given) as answer:
-            mine = {key: given.pop(key) for key in own if key in given}
-            then = function(Job(answer, **{"deck": Path(), **given}), **mine)
+        shared = {key: value for key, value in given.items() if key not in own}
+        with Job(blank(name, given), **{"deck": Path(), **shared}) as job:
+            then = function(job, **{key: value for key, value in given.items() if key in own})
         if then is not None:
             then()
 
@@ -185,7 +293,7 @@ def _with_sources(circuit: fs.Circuit, texts: list[str]) -> fs.Circuit:
         known = ", ".join(names.values()) or "no source"
         if not named and len(names) != 1:
             raise InputError(f"--source {text!r}: the circuit has {known}; allowed: NAME=SPEC with one of these names")
-        name = names.get(named.lower(), "") if named else next(iter(names.values()))
+        name = names.get(named.lower(), "") if named else known
         if not name or name in sources:
             problem = "is given twice" if name else f"is not a source of the circuit; allowed: {known}"
             raise InputError(f"--source {text!r}: {named or name} {problem}")
@@ -193,8 +301,7 @@ def _with_sources(circuit: fs.Circuit, texts: list[str]) -> fs.Circuit:
             sources[name] = source_from_text(spec, circuit)
         except InputError as error:
             raise InputError(f"--source {error.message}") from None
-        wave = sources[name]
-        long = isinstance(wave, fs.PWL) and len(wave.times) > MOST_SHOWN
+        long = isinstance(wave := sources[name], fs.PWL) and len(wave.times) > MOST_SHOWN
         if long or isinstance(wave, fs.Samples) or len(repr(wave)) > LONGEST_SOURCE:
             named_by[name] = spec
     changed = overridden(circuit, sources)
@@ -220,9 +327,8 @@ def with_times(circuit: fs.Circuit, stop: str | None, start: str = "deck") -> tu
         raise InputError(f"--stop {last:g} s; allowed: more than 0 s")
     if t_start is not None and not 0.0 <= first < last:
         raise InputError(f"--start {first:g} s; allowed: from 0 s to less than the end, {last:g} s")
-    least = first + tran.step
-    enough = last >= first + tran.step * (1.0 - 1e-12)
-    require(enough, f"--stop {last:g} s", "before the second output", f"TSTART + TSTEP = {least:g} s or more")
+    enough, least = last >= first + tran.step * (1.0 - 1e-12), f"TSTART + TSTEP = {first + tran.step:g} s or more"
+    require(enough, f"--stop {last:g} s", "before the second output", least)
     return dataclasses.replace(circuit, tran=dataclasses.replace(tran, stop=last, start=first)), start
 
 
@@ -271,106 +377,16 @@ def check_output(file: Path, deck: Path | None = None) -> None:
         raise InputError(f"cannot write {file}: {error.strerror}; {allowed}") from None
 
 
-#: What makes the files of a job, by their endings: it draws a picture or gives None; else it is given the path.
-Makes = Mapping[str, Callable[..., Any]]
-
-
-class Results:
-    """The files with these endings that a job writes for its circuit, checked before anything is run.
-
-    They go into the job's folder (`FOLDER` by default) under its name (that of the deck); with `overwrite` they may
-    replace files of other or unknown circuits.
-    """
-
-    def __init__(self, job: Job, circuit: fs.Circuit, *ends: str) -> None:
-        name, allowed = job.name, "a file's name without folder and end; --out names the folder"
-        plain = name is None or (name not in ("", ".", "..") and Path(name).name == name and name.isprintable())
-        require(plain, "--name", repr(name), allowed)
-        self.job, self.folder, self.name = job, job.out or FOLDER, name or (circuit.path or job.deck).stem
-        wanted = [end for end in ends if not (job.no_plot and end.endswith(".png"))]
-        self.files = {end: self.folder / f"{self.name}{end}" for end in wanted}
-        # Texts kept in a picture: the circuit, and the files that are made with the picture.
-        self.about = {
-            "program": "fingerspice", "title": circuit.title, "file": str(circuit.path or ""),
-            "deck_sha256": _hash(circuit.text), "overrides": json.dumps(dict(circuit.overrides)),
-            "charge_law": job.charge_law or circuit.charge_law or "local",
-            "files": json.dumps([file.name for file in self.files.values()]),
-        }  # fmt: skip
-        earlier = False
-        for file in self.files.values():
-            check_output(file, job.deck)
-            if file.is_file() and not job.overwrite:
-                earlier |= self._of_earlier_text(file)
-        if earlier:
-            complain(f"note: the results in {self.folder} are of an earlier text of {job.deck} and are replaced")
-
-    def give(self, text: Callable[[], str], makes: Makes) -> None:
-        """Give a text and write the files."""
-        if self.files:
-            self.open()
-        self.job.answer.give(text, [partial(self._write, file, makes[end]) for end, file in self.files.items()])
-
-    def _write(self, file: Path, make: Callable[..., Any]) -> Path | None:
-        if file.suffix != ".png":
-            make(file)
-            return file
-        from fingerspice.plots.drawing import save
-
-        picture = make()
-        return None if picture is None else save(picture, file, about=self.about)
-
-    def open(self) -> None:
-        """When the default folder is created, put a .gitignore into it, to keep results out of version control."""
-        if self.job.out is None and not self.folder.exists():
-            # Ignore an error: writing the results will then fail as well, with a message.
-            with suppress(InputError):
-                write_aside(self.folder / ".gitignore", lambda path: path.write_text("*\n"))
-
-    def _of_earlier_text(self, file: Path) -> bool:
-        """Whether a file is of an earlier text of the deck; refused is one of another circuit, or an unknown one."""
-        held, own = _held(file), self.about
-        ways = "allowed: --name NAME, another --out, or --overwrite"
-        if held is None:
-            if not _is_table(file):
-                raise InputError(f"{file} is there already, and nothing says which circuit it is of; {ways}")
-            complain(f"note: {file} is replaced; a table alone does not say which circuit it is of")
-            return False
-        same_deck = held["deck_sha256"] == own["deck_sha256"]
-        if json.loads(held["overrides"]) != json.loads(own["overrides"]):
-            said = [_of(one) for one in (held, own)]
-        elif held["charge_law"] != own["charge_law"]:
-            said = [f"under the {one['charge_law']} law" for one in (held, own)]
-        elif not same_deck and (held.get("file", "") != own["file"] or not held.get("file")):
-            said = [f"of the deck {held.get('file') or 'of another text'}", f"of {self.job.deck}"]
-        else:
-            return not same_deck
-        raise InputError(f"{file} holds a result {said[0]}, and this one is {said[1]}; {ways}")
-
-
-def _of(held: Mapping[str, str]) -> str:
-    changed = json.loads(held["overrides"])
-    if not changed:
-        return "of the deck as it is"
-    said = [f"{path}={value if len(value) <= 40 else value[:36] + ' ...'}" for path, value in changed.items()]
-    return f"with {', '.join(said[:8])}"
+def _with(changes: Mapping[str, str]) -> str:
+    said = [f"{path}={value if len(value) <= 40 else value[:36] + ' ...'}" for path, value in changes.items()]
+    return f"with {', '.join(said[:8])}" if said else "of the deck as it is"
 
 
 def _hash(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "replace")).hexdigest()
 
 
-def _held(file: Path) -> dict[str, str] | None:
-    """Attributes of a file that name its deck, changes and charge law; None if it has none."""
-    try:
-        found = _attributes(file)
-        known = all(isinstance(found.get(key), str) for key in ("deck_sha256", "overrides", "charge_law"))
-        return found if known and isinstance(json.loads(found["overrides"]), dict) else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, SyntaxError):
-        # The file was not written by this package.
-        return None
-
-
-def _attributes(file: Path) -> dict[str, Any]:
+def _texts_in(file: Path) -> dict[str, Any]:
     """Texts kept in a file; of a table, those in the picture of the same name, if it lists the table's file."""
     if file.suffix == ".nc":
         import h5netcdf
@@ -392,10 +408,3 @@ def _attributes(file: Path) -> dict[str, Any]:
         image.load()
         text: dict[str, Any] = dict(getattr(image, "text", {}))
     return text if file.name in json.loads(text.get("files", "[]")) else {}
-
-
-def _is_table(file: Path) -> bool:
-    """Whether a file begins like the tables that the commands write; a WAV file, whether such a table is beside it."""
-    with suppress(OSError), (file.with_suffix(".csv") if file.suffix == ".wav" else file).open("rb") as stream:
-        return stream.read(100).startswith(_HEADS)
-    return False

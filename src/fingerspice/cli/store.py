@@ -25,7 +25,7 @@ from fingerspice.base.compiled import STAMP
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import settle_on_disk, write_aside, write_durably
 from fingerspice.circuit.describe import digests
-from fingerspice.cli.options import Job, Results, check_output, number
+from fingerspice.cli.options import Job, check_output, number
 from fingerspice.results.record import SIGNALS, variables
 from fingerspice.results.runfile import CHECKSUM, SIGNATURE, Array, attributes_of, create, signature, tidy, zarr_library
 from fingerspice.solve.streaming import Stream, stream
@@ -33,8 +33,7 @@ from fingerspice.solve.streaming import Stream, stream
 #: Attributes of the group: identity of the run, number of finished chunks, state to continue from, results so far, and
 #: the number of columns of each array, 0 for one without.
 RUN, DONE, MARK, SO_FAR, COLUMNS = "run", "chunks_done", "goes_on", "so_far", "arrays"
-# Number of bytes of the store that are copied at once.
-_PIECE = 1 << 25
+_PIECE = 1 << 25  # Number of bytes of the store that are copied at once
 
 
 class Store:
@@ -75,8 +74,8 @@ class Store:
         self._hold(self.path)
         try:
             held = attributes_of(self.path)
-            whole = all(isinstance(held[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
-            whole = whole and isinstance(held[DONE], int) and held[DONE] >= 0
+            kinds = {RUN: dict, MARK: dict, SO_FAR: dict, COLUMNS: dict, DONE: int}
+            whole = all(isinstance(held[key], kind) for key, kind in kinds.items()) and held[DONE] >= 0
             whole = whole and held.get(SIGNATURE, "") in ("", signature(held))
         except (OSError, ValueError, KeyError, TypeError):
             whole = False
@@ -116,10 +115,9 @@ class Store:
         """Write a chunk, then record it as finished; `mark` is the state from which the run continues."""
         data, coords = variables(solution, np.ones(solution.t.size, bool), signals)
         data = {"time": coords["time"], **data}
-        columns = {name: values.shape[1] if values.ndim > 1 else 0 for name, (_, values, _) in data.items()}
-        names = {dim: one[1].tolist() for dim, one in coords.items() if dim != "time"}
+        columns = {name: sum(values.shape[1:]) for name, (_, values, _) in data.items()}
         arrays = {
-            name: self._array(name, columns[name], dims, said | {d: names[d] for d in dims[1:]})
+            name: self._array(name, columns[name], dims, said | {dim: coords[dim][1].tolist() for dim in dims[1:]})
             for name, (dims, _, said) in data.items()
         }
         self.so_far = {
@@ -167,8 +165,8 @@ class Store:
                     lengths = dict(zip(array.metadata.dimension_names, array.shape, strict=True))
                     file.dimensions.update({key: x for key, x in lengths.items() if key not in file.dimensions})
                     variable = file.create_variable(name, tuple(lengths), dtype="f8")
-                    for key, value in array.attrs.asdict().items():
-                        variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
+                    about = array.attrs.asdict()
+                    variable.attrs.update({k: x if isinstance(x, str) else json.dumps(x) for k, x in about.items()})
                     rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
                     for at in range(0, self.total, rows):
                         variable[at : at + rows] = array[at : at + rows]
@@ -184,8 +182,8 @@ def run_streamed(
     names, answer = _names(signals, circuit), job.answer
     charge = any(name in ("q_source", "i_source") for name in names)
     run = stream(circuit, chunk=number("--chunk", chunk), charge=charge, **how)
-    results = Results(job, circuit, *([".nc"] if netcdf else []))
-    path = results.folder / f"{results.name}.zarr"
+    name = job.check_files(circuit, *([".nc"] if netcdf else []))
+    path = name.with_name(f"{name.name}.zarr")
     # The store is a folder, so check that a file can be written next to it.
     check_output(path.with_suffix(".zarr.part"), job.deck)
     total, span = run.outputs.total, run.problem.t_stop - run.problem.t_start
@@ -194,22 +192,21 @@ def run_streamed(
         store.open(job.overwrite)
         if store.done and store.done < store.chunks:
             run.go_to(store.mark, store.done * store.count)
-        results.open()
+        job.make_folder()
         begun, first = time.perf_counter(), store.done
         answer["files"].append(str(path))
-        if first < store.chunks:
-            _fill(run, store, names, results)
-        took = time.perf_counter() - begun
         said = [f"{total:,} outputs of {span:g} s in {store.chunks:,} piece{'s' if store.chunks > 1 else ''}: {path}"]
         if first < store.chunks:
-            said.append(f"{(store.chunks - first) / store.chunks * span / took:,.3g} times real time")
+            _fill(run, store, names, {key: text for key, text in job.about.items() if key != "files"})
+            speed = (store.chunks - first) / store.chunks * span / (time.perf_counter() - begun)
+            said.append(f"{speed:,.3g} times real time")
         error = store.so_far["error"]
         said.append(f"stated error {error['u_gap']:.2g} V of the gap voltage, {error['f_el']:.2g} N of the force")
         if first:
             said.append(f"the first {first:,} were there already")
-        found = {"chunks": store.chunks, "found": first, "outputs": total, "seconds": took}
+        found = {"chunks": store.chunks, "found": first, "outputs": total, "seconds": time.perf_counter() - begun}
         answer.update(**store.so_far, stream=found)
-        results.give(lambda: "; ".join(said), {".nc": store.to_netcdf})
+        job.give(lambda: "; ".join(said), {".nc": store.to_netcdf})
 
 
 def _names(signals: str | None, circuit: fs.Circuit) -> list[str]:
@@ -236,9 +233,8 @@ def _identity(run: Stream, circuit: fs.Circuit, how: dict[str, Any], names: list
     }  # fmt: skip
 
 
-def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None:
+def _fill(run: Stream, store: Store, names: list[str], about: dict[str, str]) -> None:
     """Compute and write all missing chunks; a chunk is written while the next one is computed."""
-    about = {key: text for key, text in results.about.items() if key != "files"}
     start, span = run.problem.t_start, run.problem.t_stop - run.problem.t_start
     first = float(run.outputs.times(run.done, run.done + 1)[0])
     with ThreadPoolExecutor(1) as writer, paced("simulating", (first - start) / span) as show:

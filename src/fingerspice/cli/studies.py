@@ -15,8 +15,7 @@ import fingerspice as fs
 from fingerspice.base.announcing import paced
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
-from fingerspice.cli.options import Job, Makes, Results, number
-from fingerspice.cli.terminal import Answering
+from fingerspice.cli.options import Job, Makes, number
 from fingerspice.waveforms.waveform import require
 
 #: Keys of a sweep's file, and the arguments of `batch` among them.
@@ -28,10 +27,8 @@ _KINDS = {
     "uniform": "[low, high]", "loguniform": "[low, high]", "normal": "[mean, standard deviation]",
     "lognormal": "[median, standard deviation of the logarithm]",
 }  # fmt: skip
-#: Largest number of messages about scenes without a result that are printed.
-_MOST_TOLD = 8
-#: Largest size of a sweep's file, bytes.
-_LARGEST = 1 << 20
+#: Largest number of messages about scenes without a result that are printed, and size of a sweep's file, bytes.
+_MOST_TOLD, _LARGEST = 8, 1 << 20
 
 
 def _report(job: Job, circuit: fs.Circuit, files: Mapping[str, str], make: Callable[[], Any], key: str = "") -> None:
@@ -39,10 +36,10 @@ def _report(job: Job, circuit: fs.Circuit, files: Mapping[str, str], make: Calla
 
     The files are checked first. The data are keys of the answer, or all of them one key.
     """
-    results = Results(job, circuit, *files)
+    job.check_files(circuit, *files)
     found = make()
     job.answer.update({key: found.to_dict()} if key else found.to_dict())
-    results.give(lambda: str(found), {end: getattr(found, method) for end, method in files.items()})
+    job.give(lambda: str(found), {end: getattr(found, method) for end, method in files.items()})
 
 
 def design(
@@ -183,7 +180,7 @@ def sweep(
     if store is None:
         for option, given in (("workers", workers), ("scheduler", scheduler), ("shard", shard)):
             require(given is None, f"--{option}", "given without --store", "--store OUT.zarr, too")
-        results = Results(job, circuit, ".nc", ".png")
+        job.check_files(circuit, ".nc", ".png")
     else:
         if asked.get("indices"):
             raise InputError(f"{file}: indices = true and --store are both given; allowed: one of them")
@@ -193,17 +190,16 @@ def sweep(
         options |= {"store": store, "workers": workers, "scheduler": scheduler, "shard": part_of}
     found = populations.sweep(circuit, parameters, **options)
     answer, about = job.answer, found.attrs
-    known = {"sets": about.get("sets", []), "n": about.get("n"), "seed": about.get("seed")}
-    answer.update(scenes=int(found.status.size), **known)
+    answer.update(scenes=int(found.status.size), sets=about.get("sets", []), n=about.get("n"), seed=about.get("seed"))
     if store is not None:
         answer["files"].append(str(store))
         answer.update(store={key: about[key] for key in ("chunks", "chunks_found", "chunks_missing", "seconds")})
-        whole = not about["chunks_missing"] and found.status.size <= populations.MOST_SCENES
-        said = [_told(answer, found)] if whole else []
+        few = not about["chunks_missing"] and found.status.size <= populations.MOST_SCENES
+        said = [_told(answer, found)] if few else []
         said.append(f"{about['chunks']:,} pieces ({about['chunks_found']:,} were there already) in {store}")
         if about["chunks_missing"]:
             said.append(f"{about['chunks_missing']:,} pieces of other parts are missing")
-        answer.give(lambda: "\n".join([*said, *about["failures"][:_MOST_TOLD]]))
+        job.give(lambda: "\n".join([*said, *about["failures"][:_MOST_TOLD]]))
         return
     output = str(next(iter(found.data_vars)))
     indices = populations.sobol(circuit, parameters, **options) if asked.get("indices") else None
@@ -212,23 +208,25 @@ def sweep(
         shares = populations.ranking(indices, output)
         answer.update(shares=shares)
         said.append(_shared(shares, output))
-    own = {"deck": circuit.text, **results.about}
-    plot = partial(plot_sweep, found, output, indices)
-    makes: Makes = {".nc": partial(_written, found, indices, own), ".png": plot}
-    results.give(lambda: "\n\n".join(said), makes)
+    whole = found if indices is None else found.merge(indices, compat="override", combine_attrs="drop_conflicts")
+    known = {key: value for key, value in whole.attrs.items() if value is not None and value != []}
+    whole.attrs = {**known, "deck": circuit.text, **job.about}
+    makes: Makes = {
+        ".nc": lambda file: write_aside(file, lambda aside: whole.to_netcdf(aside, engine="h5netcdf")),
+        ".png": partial(plot_sweep, found, output, indices),
+    }
+    job.give(lambda: "\n\n".join(said), makes)
 
 
-def _told(answer: Answering, found: Any) -> str:
+def _told(answer: dict[str, Any], found: Any) -> str:
     """Fill the answer with the percentiles of a whole sweep, which this text has."""
     from fingerspice.studies.sweep.populations import summary
 
     rows = summary(found)
     answer.update(figures=rows, failed=int((found.status >= 2).sum()))
-    lines = [f"{'output':<24}{'unit':<8}{'5 %':>12}{'median':>12}{'95 %':>12}{'mean':>12}"]
-    for row in rows:
-        figures = [f"{row[key]:>12.4g}" for key in ("p5", "median", "p95", "mean")]
-        lines.append(f"{row['output']:<24}{row['unit']:<8}{''.join(figures)}")
-    return "\n".join(lines)
+    line = "{output:<24}{unit:<8}{p5:>12.4g}{median:>12.4g}{p95:>12.4g}{mean:>12.4g}"
+    head = f"{'output':<24}{'unit':<8}{'5 %':>12}{'median':>12}{'95 %':>12}{'mean':>12}"
+    return "\n".join([head, *(line.format(**row) for row in rows)])
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Path]:
@@ -294,12 +292,10 @@ def _shared(rows: list[dict[str, Any]], output: str) -> str:
     first: dict[str, list[str]] = {}
     for row in rows:
         # A number, or the name of a set.
-        shown = {name: x if isinstance(x, str) else f"{x:.4g}" for name, x in row["place"].items()}
-        place = ", ".join(f"{name} = {text}" for name, text in shown.items())
+        place = ", ".join(f"{name} = {x if isinstance(x, str) else f'{x:.4g}'}" for name, x in row["place"].items())
         if place not in lines:
             first.setdefault(row["parameter"], []).append(place)
-        told = f"{row['total']:.2f} ({row['low']:.2f}-{row['high']:.2f})"
-        lines.setdefault(place, {})[row["parameter"]] = told
+        lines.setdefault(place, {})[row["parameter"]] = "{total:.2f} ({low:.2f}-{high:.2f})".format(**row)
     wide = max(len(place) for place in lines) + 2 * any(lines)
 
     def line(place: str, cells: Mapping[str, str]) -> str:
@@ -312,11 +308,3 @@ def _shared(rows: list[dict[str, Any]], output: str) -> str:
     )
     title = f"share of the variance of {output} that comes from a parameter, its interactions included (95 % interval)"
     return "\n".join([title, head, *body, f"largest share: {most}"])
-
-
-def _written(found: Any, indices: Any, about: Mapping[str, str], path: Path) -> Path:
-    """Write both Datasets into one NetCDF file, with what it is about."""
-    whole = found if indices is None else found.merge(indices, compat="override", combine_attrs="drop_conflicts")
-    known = {key: value for key, value in whole.attrs.items() if value is not None and value != []}
-    whole.attrs = {**known, **about}
-    return write_aside(path, lambda aside: whole.to_netcdf(aside, engine="h5netcdf"))

@@ -65,8 +65,7 @@ def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool 
     """Put a legend above the panel, where it hides no data; a ``$`` is a plain character unless `math` is set."""
     place: dict[str, Any] = {"loc": "lower right" if right else "lower left", "bbox_to_anchor": (right, 1.0)}
     place |= {"borderaxespad": 0.1, "borderpad": 0.2, "handlelength": 1.8, "columnspacing": 1.2}
-    legend = ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place)
-    for text in legend.get_texts():
+    for text in ax.legend(ncols=columns, fontsize=FONT - 0.5, frameon=False, **place).get_texts():
         text.set_parse_math(math)
         text.set_text(drawable(text.get_text(), LONGEST_LABEL))
 
@@ -124,9 +123,8 @@ def thin(t: FloatArray, x: FloatArray, bins: int = MAX_BINS) -> tuple[FloatArray
         return t, x
     blocks = x[: width * bins].reshape(bins, width)
     start = width * np.arange(bins)
-    tail = np.arange(width * bins, t.size)
     ends = (start, start + width - 1, start + blocks.argmin(1), start + blocks.argmax(1))
-    keep = np.unique(np.concatenate([*ends, tail]))
+    keep = np.unique(np.concatenate([*ends, np.arange(width * bins, t.size)]))
     return t[keep], x[keep]
 
 

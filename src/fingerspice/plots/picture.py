@@ -111,7 +111,7 @@ def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> P
     dims = [str(dim) for dim in one.dims if dim != "scene"]
     if len(dims) > 1:
         raise InputError(f"{output} has the dimensions {', '.join(dims)}; allowed in a picture: one beside scene")
-    values = one.transpose(*dims, *(["scene"] if "scene" in one.dims else [])).values
+    values = one.transpose(*dims, ...).values
     factor, unit = drawing.engineering(drawing.peak_of(np.nan_to_num(values)), one.attrs.get("units", ""), 0.05)
     label = f"{output} [{unit}]" if unit else output
     if dims:
@@ -134,10 +134,9 @@ def _along(
     """Band and median along the grid: one panel, or one for each parameter and one for its shares."""
     unit, named = grid.attrs.get("units", ""), grid.dtype.kind in "OUT"
     x = np.asarray(np.arange(grid.size) if named else grid.values, float)
-    names = [] if indices is None else [str(name) for name in indices.parameter.values]
-    rows, columns = ((len(names) + 2) // 2, 2) if names else (1, 1)
+    bands = 1 if indices is None else indices.parameter.size
+    rows, columns = (1, 1) if indices is None else ((bands + 2) // 2, 2)
     figure, axes = drawing.new_figure(rows, columns, height=2.4 * rows, sharex=True)
-    bands = max(1, len(names))
     # Values of each place: one, or many, of which the middle nine tenths are shown.
     low, middle, high = (values,) * 3 if values.ndim == 1 else np.nanquantile(values, [0.05, 0.5, 0.95], axis=-1)
     for j, ax in enumerate(axes[:bands]):

@@ -78,12 +78,11 @@ def _levels(circuit: Circuit) -> dict[str, int]:
         matrix[[p, n], [n, p]] -= 1.0
         driven[[p, n]] += np.array([1.0, -1.0]) * {"V": 1.0, "I": -1.0}.get(e.device, 0.0)
     potential = np.linalg.lstsq(matrix, driven, rcond=None)[0].round(9)
-    falling = sorted(nodes, key=lambda node: (node == _GROUND, -potential[number[node]], number[node]))
     level: dict[str, int] = {}
-    for node in falling:
+    # Ground is the last, so that no other node's level depends on it.
+    for node in sorted(nodes, key=lambda node: (node == _GROUND, -potential[number[node]], number[node])):
         ends = (end for e in circuit.elements if node in e.nodes[:2] for end in e.nodes[:2])
         level[node] = 1 + max((level[end] for end in ends if end in level), default=-1)
-    # `falling` has ground last, so that no other node's level depends on it.
     level[_GROUND] = 1 + max(level[node] for node in nodes if node != _GROUND)
     return level
 

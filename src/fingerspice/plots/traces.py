@@ -64,41 +64,41 @@ def plot_solution(solution: Solution, signals: Any = None, window: Any = None, o
     marks, heights = _turns(runs, panels[0], start, stop)
     dense = marks.size > 2 * MOST_DRAWN
     zoomed = _zoom(marks, heights, start, stop)
+    spans = [(start, stop)] if zoomed is None else [(start, stop), zoomed]
     shares = [1.5 if signal_of(keys[0]).axis == "Voltage" else 1.1 for keys in panels]
-    widths = [1.0] if zoomed is None else [1.5, 1.0]
     figure, axes = drawing.new_figure(
-        len(panels), len(widths), height=max(3.4, 0.7 + 1.15 * sum(shares)), height_ratios=shares, width_ratios=widths,
-        sharex="col", sharey="row",
+        len(panels), len(spans), height=max(3.4, 0.7 + 1.15 * sum(shares)), height_ratios=shares,
+        width_ratios=[1.5, 1.0][: len(spans)], sharex="col", sharey="row",
     )  # fmt: skip
-    left, right = axes[:: len(widths)], [] if zoomed is None else axes[1::2]
-    for row, keys in enumerate(panels):
-        traces, factor, unit = draw_panel(left[row], runs, keys, start, stop, marks if dense else None)
-        if zoomed is not None:
-            for trace in traces:
-                _draw_line(right[row], trace._replace(label="_"), factor, *zoomed, time_unit(runs)[0])
+    columns = [axes[k :: len(spans)] for k in range(len(spans))]
+    for keys, first, *enlarged in zip(panels, *columns, strict=True):
+        traces, factor, unit = draw_panel(first, runs, keys, start, stop, marks if dense else None)
+        last = enlarged[0] if zoomed is not None else first
+        for trace in traces if zoomed is not None else ():
+            _draw_line(last, trace._replace(label="_"), factor, *spans[-1], time_unit(runs)[0])
         if keys == ["f_el"] and len(traces) == 1:
-            _draw_mean(left[row], traces[0], factor, unit, told=not right)
-            if right:
-                _draw_mean(right[row], traces[0], factor, unit)
-                drawing.legend_above(right[row], 1)
-        finish_panel(left[row], keys, traces, factor, unit, _HALF if right else _PAGE)
+            for ax in (first, *enlarged):
+                _draw_mean(ax, traces[0], factor, unit, told=ax is last)
+            if enlarged:
+                drawing.legend_above(last, 1)
+        finish_panel(first, keys, traces, factor, unit, _HALF if enlarged else _PAGE)
         if keys == ["f_t"] and len(traces) == 1:
-            _coefficient_axis((right or left)[row], traces[0].solution, factor)
-    time_axis(left, runs, start, stop)
+            _coefficient_axis(last, traces[0].solution, factor)
+    for column, span in zip(columns, spans, strict=True):
+        time_axis(column, runs, *span)
     small = about_all(runs)
     if zoomed is not None:
-        time_axis(right, runs, *zoomed)
-        for ax in right:
+        for ax in columns[1]:
             # Times in an enlargement have many digits, so that only three tick labels have room.
             ax.locator_params(axis="x", nbins=3)
         whole = f"envelope of {marks.size // 2} oscillations" if dense else "the whole run"
         part = f"the last {ZOOMED}" if dense and marks[-1] <= zoomed[1] else "enlarged"
-        left[-1].set_xlabel(f"{left[-1].get_xlabel()}: {whole}", fontsize=drawing.FONT)
-        right[-1].set_xlabel(f"{right[-1].get_xlabel()}: {part}", fontsize=drawing.FONT)
+        for ax, told in zip(axes[-2:], (whole, part), strict=True):
+            ax.set_xlabel(f"{ax.get_xlabel()}: {told}")
         if dense and np.count_nonzero((solution.t >= zoomed[0]) & (solution.t <= zoomed[1])) < _FEWEST * ZOOMED:
             small += f" · fewer than {_FEWEST} outputs an oscillation: their shape needs a shorter TSTEP"
     drawing.caption(figure, small, drawing.GREY if all(run.success for run, _ in runs) else drawing.VERMILION)
-    figure.align_ylabels(left)
+    figure.align_ylabels(columns[0])
     return figure
 
 
@@ -346,8 +346,7 @@ def about_all(runs: Sequence[Drawn]) -> str:
             f"method {s.method}, rtol {s.rtol:.2g}", f"error estimate {s.error.u_gap:.2g} V{force}",
         ))  # fmt: skip
     if len(runs) == 1:
-        end = [] if runs[0][0].success else [runs[0][0].message]
-        return " · ".join([fact for fact in facts[0] if fact] + end)
+        return " · ".join(filter(None, (*facts[0], "" if runs[0][0].success else runs[0][0].message)))
     alike = [len(set(same)) == 1 for same in zip(*facts, strict=True)]
     shared = [f for f, same in zip(facts[0], alike, strict=True) if f and same]
     own = []
@@ -370,8 +369,7 @@ def plot_spectrum(spectrum: Spectrum) -> Picture:
     color, unit = COLORS[signal.axis], spectrum.unit.replace("^2", "²")
     label = f"{signal.text.capitalize()} {spectrum.signal.partition(':')[2]}".rstrip()
     if spectrum.amplitude is not None:
-        least = _DRAWN * drawing.peak_of(spectrum.amplitude)
-        stems(ax, spectrum.frequency, spectrum.amplitude, least, color=color)
+        stems(ax, spectrum.frequency, spectrum.amplitude, _DRAWN * drawing.peak_of(spectrum.amplitude), color=color)
         drawing.dress(ax, f"{label}: amplitude [{unit}]", "Frequency [Hz]")
         small = f"Fourier integrals over a period; {spectrum.frequency.size} lines, {spectrum.resolution:.4g} Hz apart"
     else:
@@ -464,7 +462,6 @@ def _plot_gains(axes: Sequence[Axes], results: Sequence[PhasorSolution]) -> str:
 
 def _against_frequency(ax: Axes, result: PhasorSolution, values: FloatArray, y_label: str, **style: Any) -> None:
     order = np.argsort(result.frequency)
-    marker = "o" if order.size < 12 else ""
-    ax.plot(result.frequency[order], values[order], linewidth=1.5, marker=marker, **style)
+    ax.plot(result.frequency[order], values[order], linewidth=1.5, marker="o" if order.size < 12 else "", **style)
     drawing.dress(ax, y_label)
     ax.set_xscale("log")

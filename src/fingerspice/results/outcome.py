@@ -113,11 +113,8 @@ class Failure:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, SI units."""
-        return {
-            "status": self.status.name, "cause": self.cause, "action": self.action, "t": self.t, "step": self.step,
-            "element": self.element, "u_gap": self.u_gap, "area": self.area, "fold_margin": self.fold_margin,
-            "tried": [a._asdict() for a in self.tried],
-        }  # fmt: skip
+        order = dict.fromkeys(("status", "cause", "action", "t", "step"), self.step)
+        return order | vars(self) | {"status": self.status.name, "tried": [a._asdict() for a in self.tried]}
 
 
 class SolveError(FingerspiceError, RuntimeError):

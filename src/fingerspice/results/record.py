@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, read_only
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.network import Network
 from fingerspice.engine.network import Net
@@ -50,23 +50,11 @@ SIGNALS = {
     ),
     "v": Signal("V", "node voltage", "node", "Voltage", 2.0, of="node"),
 }
-#: Signals that follow from another one of the same gap, with its contact.
-_FOLLOWING: dict[str, tuple[str, Callable[[Contact, FloatArray], FloatArray]]] = {
-    "sigma_el": ("u_gap", Contact.stress),
-    "f_t": ("f_el", lambda contact, f: contact.mu * (contact.f_n + f)),
-    "friction": ("f_t", lambda contact, f: f / contact.f_n),
-}
 
 
 def signal_of(name: str) -> Signal:
     """What is fixed about a signal that is given as ``key`` or ``key:element``."""
     return SIGNALS[name.partition(":")[0]]
-
-
-def sealed(x: FloatArray) -> FloatArray:
-    """The same array, read-only."""
-    x.flags.writeable = False
-    return x
 
 
 class Sealed:
@@ -76,17 +64,19 @@ class Sealed:
         for value in vars(self).values():
             for array in value.values() if isinstance(value, dict) else (value,):
                 if isinstance(array, np.ndarray):
-                    sealed(array)
+                    array.flags.writeable = False
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         Sealed.__post_init__(self)
 
 
-def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray:
-    """Signals (n_t,) of several elements as a table, that of one as it is."""
-    # A view of a run's rows is copied, so that it does not seal them.
-    return sealed(np.column_stack([*columns]) if len(columns) != 1 else np.array(columns[0]))
+def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray | None:
+    """Signals (n_t,) of several elements as a table, that of one as it is; None of no element."""
+    if len(columns) < 2:
+        # A view of a run's rows is copied, so that it does not seal them.
+        return read_only(np.array(columns[0])) if len(columns) else None
+    return read_only(np.column_stack([*columns]))
 
 
 class Signals(Sealed):
@@ -103,22 +93,19 @@ class Signals(Sealed):
         """Names of the GAPs."""
         return tuple(name for name, _ in self.fingers)
 
-    def value(self, key: str) -> FloatArray | None:
-        """A signal, shape (n_t,), or (n_t, n) where n elements have it; None where the run has no such signal."""
-        if SIGNALS[key].of == "gap" and key != "area" and not self.fingers:
-            return None
-        if key in _FOLLOWING and key not in vars(self):
-            base, make = _FOLLOWING[key]
-            pairs = zip(self.fingers, self.each(base), strict=True)
-            vars(self)[key] = side_by_side([make(contact, x) for (_, contact), x in pairs])
-        found: FloatArray | None = getattr(self, key, None)
-        return found
+    def _of_gaps(self, key: str, make: Callable[[Contact, FloatArray], FloatArray]) -> FloatArray | None:
+        """A signal that follows from another one of the same gap, with its contact."""
+        return side_by_side([make(own[1], x) for own, x in zip(self.fingers, self.each(key), strict=True)])
+
+    sigma_el = cached_property(lambda self: self._of_gaps("u_gap", Contact.stress))
+    f_t = cached_property(lambda self: self._of_gaps("f_el", lambda contact, f: contact.mu * (contact.f_n + f)))
+    friction = cached_property(lambda self: self._of_gaps("f_t", lambda contact, f: f / contact.f_n))
 
     def each(self, key: str) -> Sequence[FloatArray]:
         """A signal of each of its elements, shape (n_t,); none where the run has no such signal."""
         if key == "v":
             return tuple(self.node_voltages.values())
-        value = self.value(key)
+        value = getattr(self, key, None)
         return () if value is None else (value,) if value.ndim == 1 else tuple(value.T)
 
     def columns(self, key: str) -> tuple[str, ...]:
@@ -134,13 +121,10 @@ class Signals(Sealed):
         if colon:
             return (key,)
         several = tuple(f"{key}:{name}" for name in self.columns(key))
-        if key in ("u_layer", "v"):
-            return several
         # Decide without computing the signal, where possible.
-        missing = SIGNALS[key].of == "gap" and not several
-        if key in ("q_source", "i_source") or (key == "area" and missing):
-            missing = self.value(key) is None
-        return () if missing else several if len(several) > 1 else (key,)
+        if key in ("q_source", "i_source") or (SIGNALS[key].of == "gap" and not several):
+            return () if getattr(self, key, None) is None else several if len(several) > 1 else (key,)
+        return several if len(several) > 1 or key in ("u_layer", "v") else (key,)
 
     def one(self, name: str) -> FloatArray:
         """The signal of one of the `names`, shape (n_t,)."""
@@ -162,18 +146,16 @@ class StoredRecord(Signals):
         self.t, self.sources, self.fingers = t, sources, fingers
         self.node_voltages, layers = own.pop("v"), own.pop("u_layer")
         self.layers, self.u_layer = tuple(layers), np.column_stack([np.zeros((t.size, 0)), *layers.values()])
-        vars(self).update({k: side_by_side([*x.values()]) for k, x in own.items() if x and k not in _FOLLOWING})
+        vars(self).update({key: side_by_side([*x.values()]) for key, x in own.items() if x})
         self.__post_init__()
 
 
-def attribute(get: Callable[[Any], Any], doc: str) -> Any:
-    """A property of a result, with its documentation."""
-    return property(get, doc=doc)
+attribute: Callable[..., Any] = property  # A property of a result, with its documentation.
 
 
 def _given(key: str, doc: str) -> Any:
-    """A property: a signal, None where the run has no such signal; or what else its record has."""
-    return attribute(lambda r: r.record.value(key) if key in SIGNALS else getattr(r.record, key), doc)
+    """A property: what the record has of this name, None where the run has no such signal."""
+    return attribute(lambda result: getattr(result.record, key, None), doc=doc)
 
 
 class Signalled:
@@ -184,17 +166,12 @@ class Signalled:
 
     layers: tuple[str, ...] = _given("layers", "Names of the columns of `u_layer`.")
     gaps: tuple[str, ...] = _given("gaps", "Names of the GAPs.")
-    sources: tuple[str, ...] = _given(
-        "sources", "Names of the sources of a network; of a series stack there is one, its loop."
-    )
+    sources: tuple[str, ...] = _given("sources", "Names of the sources; of a series stack there is one, its loop.")
     node_voltages: dict[str, FloatArray] = _given("node_voltages", "Node name to its voltage, V, shape (n_t,).")
-    u_source: FloatArray = _given(
-        "u_source", "Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,)."
-    )
+    u_source: FloatArray = _given("u_source", "Voltage of each source, V, shape (n_t,); of a series stack the loop's.")
     u_layer: FloatArray = _given("u_layer", "Voltage of each layer from its p to its n node, V, shape (n_t, n_layer).")
     fold_margin: FloatArray = _given(
-        "fold_margin",
-        "Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`.",
+        "fold_margin", "Distance to the fold of the `mobile` law: 1 without stored charge and under `local`, 0 at it."
     )
     area: FloatArray | None = _given("area", "Ridge contact area, m^2, shape (n_t,); None for a circuit without any.")
     q_source: FloatArray | None = _given(
@@ -203,8 +180,7 @@ class Signalled:
         "None where the run was asked to leave it out.",
     )
     i_source: FloatArray | None = _given(
-        "i_source",
-        "Current of the source, A, shape (n_t,), without the impulses at jumps, which only `q_source` shows.",
+        "i_source", "Current of the source, A, shape (n_t,), without the impulses at jumps, which `q_source` has."
     )
     u_gap: FloatArray | None = _given("u_gap", "Gap voltage, V, shape (n_t,); None for a circuit without GAP.")
     sigma_el: FloatArray | None = _given(
@@ -264,8 +240,7 @@ def variables(
         about = {"units": signal.unit, "long_name": signal.text}
         if len(columns) > 1 or key in ("u_layer", "v"):
             coords[signal.of] = ((signal.of,), np.array(solution.record.columns(key), dtype=object), {})
-            table = np.column_stack([np.zeros((int(keep.sum()), 0)), *columns])
-            data[key] = (("time", signal.of), table, about)
+            data[key] = (("time", signal.of), np.column_stack([np.zeros((int(keep.sum()), 0)), *columns]), about)
         elif columns:
             data[key] = (("time",), columns[0], about)
     return data, coords
@@ -279,7 +254,7 @@ def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
     if (lost := ~np.isfinite(out)).any():
         # A run ends where the source stops being finite, at a time known to 1e-12: use the finite value just before.
         out[lost] = waveform.value(t[lost] * (1.0 - 4e-12))
-    return sealed(out)
+    return read_only(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,7 +313,7 @@ class Record(Signals):
         return areas(self.cell_voltage(int(self.net.gap[i])), self.net.curves[i])
 
     @cached_property
-    def u_source(self) -> FloatArray:
+    def u_source(self) -> FloatArray | None:
         """Voltage of each source, V: from p to n of a V, and from n to p of an I, the direction in which it drives."""
         out, zero = list(self._s.T[: len(self.network.sources)]), np.zeros(self.t.size)
         for j, element in enumerate(self.network.sources[self.network.n_voltage :], self.network.n_voltage):
@@ -352,21 +327,20 @@ class Record(Signals):
         """Layer voltages from p to n, V, shape (n_t, n_layer)."""
         cells = map(self.cell_voltage, range(len(self.network.cells)))
         table = np.column_stack([np.zeros((self.t.size, 0)), *cells])
-        return sealed(np.einsum("tc,lc->tl", table, self.network.grouping))
+        return read_only(np.einsum("tc,lc->tl", table, self.network.grouping))
 
     @cached_property
-    def u_gap(self) -> FloatArray:
+    def u_gap(self) -> FloatArray | None:
         """Gap voltage, V."""
         return side_by_side([self.cell_voltage(gap) for gap in self.network.gaps if gap is not None])
 
     @cached_property
     def area(self) -> FloatArray | None:
         """Contact area of each GAP, m^2; without a GAP the circuit's first area; None where there is none."""
-        shown = self.network.fingers or ((0,) if self.network.areas else ())
-        return side_by_side([self._area_of(i) for i in shown]) if shown else None
+        return side_by_side([self._area_of(i) for i in self.network.fingers or range(min(1, len(self.network.areas)))])
 
     @cached_property
-    def f_el(self) -> FloatArray:
+    def f_el(self) -> FloatArray | None:
         """Electroadhesive force (Eq. 2 times A_R), N."""
         out = []
         for i, (_, contact), u in zip(self.network.fingers, self.fingers, self.each("u_gap"), strict=True):
@@ -397,7 +371,7 @@ class Record(Signals):
         net, n = self.net, self._x.shape[1]
         out = np.ones(self.t.size)
         if not net.mobile or not np.any((net.gap >= 0) & (net.slow < 0)):
-            return sealed(out)
+            return read_only(out)
         area = np.column_stack([self._area_of(i) for i in range(net.gap.size)])
         held, met = np.zeros((2, self.t.size, n, n))
         for cell in range(net.c.size):
@@ -409,11 +383,11 @@ class Record(Signals):
                 inverse, slope = inverse_area_array(np.abs(u), net.curves[i])
                 cross = net.c[cell] * self.cell_voltage(cell) * -np.sign(u) * slope / inverse**2
                 met += cross[:, None, None] * np.outer(row, net.p[net.gap[i]])
-        return sealed(np.linalg.det(held + met) / np.linalg.det(held))
+        return read_only(np.linalg.det(held + met) / np.linalg.det(held))
 
     @cached_property
     def node_voltages(self) -> dict[str, FloatArray]:  # type: ignore[override]
         """Voltage of every node against ground, V, shape (n_t,) each."""
         n = self._x.shape[1]
         rows = zip(self.network.node_names, self.network.nodes, strict=True)
-        return {name: sealed(self._voltage(row[:n], row[n:])) for name, row in rows}
+        return {name: read_only(self._voltage(row[:n], row[n:])) for name, row in rows}

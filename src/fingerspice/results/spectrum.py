@@ -17,7 +17,7 @@ from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import NOTABLE, energy_outside, heading
+from fingerspice.circuit.describe import NOTABLE, energy_outside
 from fingerspice.circuit.network import network_of
 from fingerspice.results.record import Sealed, signal_of
 from fingerspice.results.steps import Outputs
@@ -323,8 +323,8 @@ class PhasorSolution(Shown):
 
         out = [Column("frequency", "Hz", self.frequency, "frequency [Hz]", form=".6g")]
         for i, node in enumerate(self.nodes):
-            assert self.v_nodes is not None
-            polar(f"v:{node}", f"phase_deg:{node}", self.v_nodes[:, i], "V", (f"|v({node})| [V]", "phase [deg]"))
+            v = np.asarray(self.v_nodes)[:, i]
+            polar(f"v:{node}", f"phase_deg:{node}", v, "V", (f"|v({node})| [V]", "phase [deg]"))
         if not self.nodes:
             polar("gain", "phase_deg", self.gain, "1", ("|u_gap/U|", "phase [deg]"), ".5f")
             out.append(Column("u_gap", "V", np.abs(self.u_gap), "u_gap [V]"))
@@ -366,14 +366,8 @@ class PhasorSolution(Shown):
         return plot_phasor((self,), self.circuit)
 
 
-def phasor_tables(results: Sequence[PhasorSolution], circuit: Circuit) -> str:
-    """Sweeps of a circuit at several amplitudes as tables."""
-    return "\n\n".join([heading(circuit), *(r._page(40) for r in results)])
-
-
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     """Write sweeps as CSV, one after the other where there are several amplitudes."""
     tables = [r._columns() for r in results]
-    header = [f"{column.key} [{column.unit}]" for column in tables[0]]
     rows = (row for columns in tables for row in zip(*(c.values.tolist() for c in columns), strict=True))
-    return write_csv(path, header, rows)
+    return write_csv(path, [f"{column.key} [{column.unit}]" for column in tables[0]], rows)

@@ -240,8 +240,7 @@ class ClosedForm:
         count = np.maximum(np.ceil(np.diff(edges) / longest), 1.0).astype(int)
         if count.sum() > MOST_PANELS:
             return None
-        number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        return np.append(np.repeat(edges[:-1], count) + number * np.repeat(np.diff(edges) / count, count), edges[-1])
+        return np.asarray(np.interp(np.arange(count.sum() + 1), np.append(0, np.cumsum(count)), edges))
 
     def _at_points(self, begin: FloatArray, end: FloatArray) -> tuple[Record, IntArray]:
         """The record at the points of all panels, and the row of each, shape (p, ROWS)."""
@@ -283,8 +282,7 @@ class Weighed:
 
     def phasor(self, frequency: float) -> complex:
         """Complex amplitude P of a signal x ~ Im(P exp(i 2 pi f t)); the times cover whole periods."""
-        turning = self.weight * np.exp(-2j * np.pi * frequency * self.t)
-        return complex(2j * (turning * self.x).sum())
+        return complex(2j * (self.weight * np.exp(-2j * np.pi * frequency * self.t) * self.x).sum())
 
 
 def _halved(panels: Panels) -> Panels:
@@ -394,8 +392,7 @@ def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:
     for side in (0, 1):
         np.add.at(weight, few + side, 0.5 * step[few])
     i = i[size[i] >= 4]
-    first = np.clip(i - 1, begin[i], begin[i] + size[i] - 4)
-    index = first[:, None] + np.arange(4)
+    index = np.clip(i - 1, begin[i], begin[i] + size[i] - 4)[:, None] + np.arange(4)
     nodes = t[index]
     half, middle = 0.5 * step[i], 0.5 * (t[i + 1] + t[i])
     # Two Gauss points integrate a cubic exactly; it is evaluated there in Lagrange's form.

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, read_only
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
 from fingerspice.numerics.lobatto import NODES
-from fingerspice.results.record import attribute, sealed, signal_of
+from fingerspice.results.record import attribute, signal_of
 from fingerspice.results.steps import Outputs, Stretch
 
 if TYPE_CHECKING:
@@ -38,16 +38,15 @@ class Figures:
 
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
-        self.signals = solution.record
         self._kept: dict[str, Any] = dict(solution.stored or {})
         self._extremes: dict[tuple[str, bool], tuple[float, float]] = {}
 
     def value(self, key: str, kind: str) -> Value:
         """A figure of a kind that `_made` knows: a number, an array of several gaps or sources, or None."""
-        values = [self._one(name, kind) for name in self.signals.names(key)]
+        values = [self._one(name, kind) for name in self.solution.record.names(key)]
         if len(values) < 2:
             return values[0] if values else None
-        return None if None in values else sealed(np.array(values, float))
+        return None if None in values else read_only(np.array(values, float))
 
     def _one(self, name: str, kind: str) -> float | None:
         key = f"{name}_{kind}"
@@ -117,7 +116,7 @@ class Figures:
 
         None where the run is not known between its outputs, or the table is larger than `MOST_BETWEEN`.
         """
-        names = [name for key in _BETWEEN for name in self.signals.names(key)]
+        names = [name for key in _BETWEEN for name in self.solution.record.names(key)]
         if not isinstance(self.last, Stretch) or self.last.panels.shape[1] * NODES * len(names) > MOST_BETWEEN:
             return None
         t, *columns = self.last.at_nodes(names, _MISSED)
@@ -131,11 +130,9 @@ class Figures:
     @cached_property
     def shown(self) -> tuple[str, ...]:
         """Names of the signals in the summary: of gaps, or else of all layers, or else of all nodes."""
-        names = self.signals.names
-        if self.signals.gaps:
-            keys = ("u_source", "u_gap", "area", "f_el", "f_t", "friction")
-            return tuple(name for key in keys for name in names(key))
-        return (*names("u_source"), *(names("u_layer") or names("v")), *names("area"))
+        of_gaps = ("u_gap", "area", "f_el", "f_t", "friction")
+        keys = of_gaps if self.solution.record.gaps else ("u_layer" if self.solution.record.layers else "v", "area")
+        return tuple(name for key in ("u_source", *keys) for name in self.solution.record.names(key))
 
     def summary(self) -> dict[str, Any]:
         """As `Solution.summary` says."""
@@ -155,7 +152,7 @@ class Figures:
             for name in (name for name in ("u_source", "u_gap") if name in self.shown):
                 out |= {f"{name}_{kind}": one(name, kind) for kind in ("amplitude", "phase_deg")}
             out["fundamental"] = s.fundamental.frequency
-        if self.signals.gaps:
+        if self.solution.record.gaps:
             out["fold_margin_min"] = min(s.fold_margin_min, float(s.fold_margin.min(initial=1.0)))
         return out
 
@@ -166,7 +163,7 @@ class Figures:
         how = f"charge law {run.charge_law}, area {run.area_mode}, method {run.method}, rtol {run.rtol:g}"
         out: list[str | Table] = [*head_lines(run.circuit), f"{end} simulated; {how}", ""]
         if run.t.size >= 2:
-            names = [name for key in _ROWS for name in self.signals.names(key) if f"{name}_max" in s]
+            names = [name for key in _ROWS for name in self.solution.record.names(key) if f"{name}_max" in s]
             out.append(Table(("", *_COLUMNS), [_row(name, s) for name in names]))
             if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
                 out += ["last period: the mean over it; rms and ripple (max - min) are those of the last period, too"]
@@ -209,7 +206,7 @@ def _row(name: str, s: dict[str, Any]) -> tuple[str, ...]:
 
 def figure(key: str, kind: str, doc: str) -> Value:
     """A property of a result that has `_figures`: a figure of a signal."""
-    return attribute(lambda result: result._figures.value(key, kind), doc)  # type: ignore[no-any-return]
+    return attribute(lambda result: result._figures.value(key, kind), doc=doc)  # type: ignore[no-any-return]
 
 
 class Figured:
@@ -220,9 +217,8 @@ class Figured:
 
     f_el_mean = figure("f_el", "mean", "Mean electroadhesive force over the run, N.")
     f_el_mean_periodic = figure(
-        "f_el", "mean_periodic",
-        "Mean electroadhesive force over the source's last period, N; None where the run holds none.",
-    )  # fmt: skip
+        "f_el", "mean_periodic", "Mean electroadhesive force over the source's last period, N; None without one."
+    )
     f_el_peak = figure("f_el", "peak", "Largest electroadhesive force, N.")
     f_t_mean = figure("f_t", "mean", "Mean friction force over the run, N.")
     f_t_mean_periodic = figure(
@@ -237,6 +233,5 @@ class Figured:
         "Amplitude of the gap voltage at the source's fundamental, over its last period, V; None without one.",
     )  # fmt: skip
     u_gap_phase_deg = figure(
-        "u_gap", "phase_deg",
-        "Phase of the gap voltage at the source's fundamental, relative to a sine, degrees.",
-    )  # fmt: skip
+        "u_gap", "phase_deg", "Phase of the gap voltage at the source's fundamental, relative to a sine, degrees."
+    )

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import ComplexArray, FloatArray, positive_number, real_number, real_numbers
+from fingerspice.base.arrays import ComplexArray, FloatArray, positive_number, read_only, real_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.plots import drawing
 from fingerspice.plots.traces import stems
-from fingerspice.results.record import Sealed, sealed
+from fingerspice.results.record import Sealed
 from fingerspice.results.solution import Solution
 from fingerspice.results.spectrum import Spectrum
 from fingerspice.waveforms.waveform import require
@@ -127,7 +127,7 @@ class Threshold(Sealed):
     def __post_init__(self) -> None:
         for what in ("frequency", "level"):
             values = real_numbers(f"threshold's {what}", getattr(self, what), "numbers").copy()
-            object.__setattr__(self, what, sealed(values))
+            object.__setattr__(self, what, read_only(values))
         f, level = self.frequency, self.level
         good = f.ndim == 1 and f.size >= 2 and f.shape == level.shape
         require(good, "threshold", f"shapes {f.shape} and {level.shape}", "two rows of equal length, two or more")
