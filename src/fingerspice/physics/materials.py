@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
 
@@ -38,35 +38,13 @@ _RHO = (-0.023, 0.0795, -0.2133, 4.9229)
 _EPS = (-0.00286, 0.03564, -0.15785, 0.33963, -0.6235, 4.1598)
 
 
-def skin_resistivity(frequency: ArrayLike) -> NDArray[np.float64]:
-    """Resistivity of stratum corneum (Eq. 18, cubic reading).
-
-    Parameters
-    ----------
-    frequency : array_like
-        Frequency in Hz, positive.
-
-    Returns
-    -------
-    ndarray
-        Resistivity in Ohm m, shape of `frequency`.
-    """
+def skin_resistivity(frequency: ArrayLike) -> FloatArray:
+    """Resistivity of stratum corneum (Eq. 18, cubic reading), ohm m, at frequencies in Hz, which are positive."""
     return np.asarray(10.0 ** np.polyval(_RHO, np.log10(np.asarray(frequency, float))))
 
 
-def skin_permittivity(frequency: ArrayLike) -> NDArray[np.float64]:
-    """Relative permittivity of stratum corneum (Eq. 19).
-
-    Parameters
-    ----------
-    frequency : array_like
-        Frequency in Hz, positive.
-
-    Returns
-    -------
-    ndarray
-        Relative permittivity, shape of `frequency`.
-    """
+def skin_permittivity(frequency: ArrayLike) -> FloatArray:
+    """Relative permittivity of stratum corneum (Eq. 19) at frequencies in Hz, which are positive."""
     return np.asarray(10.0 ** np.polyval(_EPS, np.log10(np.asarray(frequency, float))))
 
 
@@ -97,12 +75,7 @@ class Ladder:
     def cells(self) -> tuple[FloatArray, FloatArray]:
         """The same material as slabs in series, each as thick as the layer.
 
-        Returns
-        -------
-        eps_r : ndarray, shape (n + 1,)
-            Relative permittivities for n poles.
-        rho : ndarray, shape (n + 1,)
-            Resistivities, ohm m.
+        They are given by their relative permittivities and resistivities (ohm m), shape (n + 1,) each for n poles.
         """
         p, k, c = np.array(self.poles), np.array(self.weights), EPS0 * self.eps_inf
         # Zeros of y: the rates at which an open layer comes to rest.
