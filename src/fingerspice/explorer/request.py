@@ -19,7 +19,7 @@ import fingerspice as fs
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number, spice_text
-from fingerspice.circuit.circuit import CHARGE_LAWS, nearest
+from fingerspice.circuit.circuit import CHARGE_LAWS, nearest, number_from
 from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
 from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.network import network_of
@@ -55,15 +55,13 @@ def sliders(base: fs.Circuit, shown: fs.Circuit) -> list[dict[str, Any]]:
             value, unit, spec = one.value, one.unit, specs.get(name)
             if spec is not None:
                 limits, first, meaning = _of_parameter(spec, old.values.get(name, value)), spec.first, spec.meaning
-            elif isinstance(value, (int, float)):
+            else:
                 own = getattr(old.waveform, name) if type(old.waveform) is type(e.waveform) else value
                 # A source that does not drive is on an area node, and gives mm^2.
                 drives = e.name in driving
                 limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
                 unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
                 first, meaning = name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, "")
-            else:
-                continue
             found.append({
                 "path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
                 "text": value_text(value, unit), "low": limits[0], "high": limits[1], "log": limits[2],
@@ -188,10 +186,7 @@ def read_source(
             return name, source_from_text(said, circuit, files=False), None
     words = recorded[1].replace(",", " ").split()
     require(len(words) == 1, RECORDING, f"given {len(words)} numbers", f"{RECORDING}(gain)")
-    try:
-        gain = parse_number(words[0])
-    except ValueError as error:
-        raise InputError(f"{RECORDING}: {error}") from None
+    gain = number_from(RECORDING, words[0])
     if recording is None:
         raise InputError("the source is a recording, which a link does not carry; allowed: drop its file on the page")
     return name, recording.waveform(gain), gain
@@ -283,10 +278,7 @@ def _read(name: str, given: Any) -> Any:
 def _override(path: str, value: Any) -> float:
     if isinstance(value, str) and value.strip().lower() == "inf":
         return math.inf
-    try:
-        number = parse_number(value.strip()) if isinstance(value, str) else value
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
+    number = number_from(path, value) if isinstance(value, str) else value
     require(_is_number(number), _short(path), _short(value), "a number, or text such as 3.5u")
     return float(number)
 
