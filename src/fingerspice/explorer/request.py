@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import math
 import re
+import tomllib
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -128,31 +130,16 @@ class Argument(NamedTuple):
     optional: bool = False
 
 
-def _usual(name: str, value: float, unit: str = "Hz", *, optional: bool = False) -> Argument:
-    """An argument with the range that it has as a parameter of a source."""
-    return Argument(name, unit, value, *_of_waveform(name, unit, value), optional)
+def _argument(name: str, value: float, unit: str = "", **given: Any) -> Argument:
+    """An argument, with the range that it has as a parameter of a source unless the menu gives its own."""
+    own = dict(zip(("low", "high", "log"), _of_waveform(name, unit, value), strict=True))
+    return Argument(name, unit, value, **{**own, **given})
 
 
-_AMPLITUDE, _FREQUENCY = _usual("amplitude", 200.0, "V"), _usual("frequency", 100.0)
+#: The page's menus, of waveforms and of scenes.
+MENUS = tomllib.loads(Path(__file__).with_name("menus.toml").read_text(encoding="utf-8"))
 #: By function: its name on the page, and its numbers in their order.
-WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
-    "SIN": ("Sine", (_usual("offset", 0.0, "V"), _AMPLITUDE, _FREQUENCY)),
-    "SQUARE": ("Square wave", (_AMPLITUDE, _FREQUENCY, _usual("duty", 0.5, "", optional=True))),
-    "TRIANGLE": ("Triangle", (_AMPLITUDE, _FREQUENCY)),
-    "SAWTOOTH": ("Sawtooth", (_AMPLITUDE, _FREQUENCY)),
-    "AM": ("Carrier with envelope",
-           (_AMPLITUDE, _usual("carrier", 5e3), _usual("envelope", 50.0), _usual("depth", 1.0, "", optional=True))),
-    "BURST": ("Bursts", (_AMPLITUDE, _usual("frequency", 5e3), Argument("cycles", "", 10.0, 1.0, 100.0),
-                         Argument("every", "s", 10e-3, 1e-3, 1.0, True))),
-    "CHIRP": ("Chirp", (_usual("amplitude", 150.0, "V"), _usual("from", 20.0), _usual("to", 1e3),
-                        Argument("duration", "s", 0.05, 1e-2, 3.0, True))),
-    "EXP": ("Step that rises and falls",
-            (_usual("low", 0.0, "V"), _usual("high", 200.0, "V"), Argument("start", "s", 1e-3, 0.0, 0.05),
-             Argument("rise", "s", 1e-3, 1e-5, 0.1, True), Argument("end", "s", 20e-3, 0.0, 0.1),
-             Argument("fall", "s", 2e-3, 1e-5, 0.1, True))),
-    RECORDING: ("Recording or table, dropped here", (Argument("gain", "V", 150.0, 0.0, 400.0),)),
-    "DC": ("Constant", (_usual("level", 200.0, "V"),)),
-}  # fmt: skip
+WAVEFORMS = {x["kind"]: (x["title"], tuple(_argument(**one) for one in x["arguments"])) for x in MENUS["waveform"]}
 #: Waveforms that the page can say as text; their numbers are those of the menu, one of them by another name.
 _TEXTS = {"Sine": "SIN", "Square": "SQUARE", "Triangle": "TRIANGLE", "Sawtooth": "SAWTOOTH", "AM": "AM", "DC": "DC"}
 _FIELDS = {"envelope": "modulation"}

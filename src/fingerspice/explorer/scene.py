@@ -6,7 +6,6 @@ import dataclasses
 import math
 import re
 import time
-import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Element, Tran
 from fingerspice.circuit.describe import in_force, remembering
 from fingerspice.circuit.statespace import driving_sources
-from fingerspice.explorer.request import WAVEFORMS, Asked, quiet, read_source, sliders, text_of, value_text
+from fingerspice.explorer.request import MENUS, WAVEFORMS, Asked, quiet, read_source, sliders, text_of, value_text
 from fingerspice.plots.drawing import save
 from fingerspice.results.record import SIGNALS
 
@@ -394,8 +393,7 @@ class Example(NamedTuple):
     asked: Mapping[str, object] = {}  # Further keys of the request, as in `scene`
 
 
-_FILE = Path(__file__).with_name("examples.toml")
-EXAMPLES = tuple(Example(**one) for one in tomllib.loads(_FILE.read_text(encoding="utf-8"))["scene"])
+EXAMPLES = tuple(Example(**one) for one in MENUS["scene"])
 """The scenes of the menu, the first of which is shown at the start."""
 
 
@@ -442,8 +440,9 @@ def decks(folder: Path) -> Iterator[Entry]:
 
 def scenes() -> Iterator[Entry]:
     """The example scenes of the explorer."""
+    menus = Path(__file__).with_name("menus.toml")
     for one in EXAMPLES:
-        yield Entry(f"scene-{one.name}", one.title, one.note, _FILE, partial(_run_scene, one))
+        yield Entry(f"scene-{one.name}", one.title, one.note, menus, partial(_run_scene, one))
 
 
 def _run_scene(example: Example) -> fs.Solution:

@@ -163,8 +163,10 @@ class _Instance:
         if called is None and native not in layer_devices():
             raise InputError(_unknown_device(plain, self), device.where)
         shown, wanted = (called.name, called.ports) if called else (native, DEVICES[native].nodes)
-        count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}" + (f" ({' '.join(wanted)})" if wanted else "")
-        refuse(len(nodes) != len(wanted), f"{name}: {shown} has {count}, {len(nodes)} given", device)
+        if len(nodes) != len(wanted):
+            count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}"
+            named = f" ({' '.join(wanted)})" if wanted else ""
+            raise InputError(f"{name}: {shown} has {count}{named}, {len(nodes)} given", device.where)
         if called is None:
             canonical, written = zip(*self.nodes(nodes), strict=True)
             params = scope.pairs(words, bare="arithmetic")
@@ -172,7 +174,7 @@ class _Instance:
             _refuse_captured(native, given, words, scope)
             self.deck.statements.append(Statement(name, native, canonical, written, (), params, lexemes[0].where))
             return
-        self._count(called, device.where)
+        self._count(called, device)
         ports = dict(zip(called.ports, self.nodes(nodes), strict=True))
         called.called = True
         # Values on the X line are evaluated in the caller's scope, defaults in the subcircuit's.
@@ -186,18 +188,18 @@ class _Instance:
         _refuse_captured(called.name, inner.solve(), words, scope)
         _Instance(self.deck, called, inner, around, f"{name}.", ports, (*self.calls, called)).expand()
 
-    def _count(self, called: Subcircuit, where: Where) -> None:
+    def _count(self, called: Subcircuit, device: Lexeme) -> None:
         """Count what a call expands to; refuse circles, and what is too deep or too much."""
         for start, outer in enumerate(self.calls):
             if outer is called:
                 path = " -> ".join(sub.name for sub in (*self.calls[start:], called))
-                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
+                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", device.where)
         self.deck.expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
         self.deck.expanded_text += called.characters
-        refuse(len(self.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", where)
-        refuse(self.deck.expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
+        refuse(len(self.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", device)
+        refuse(self.deck.expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", device)
         problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
-        refuse(self.deck.expanded_text > MAX_EXPANDED_TEXT, problem, where)
+        refuse(self.deck.expanded_text > MAX_EXPANDED_TEXT, problem, device)
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:
