@@ -92,8 +92,7 @@ def exponent_and_scale(text: str) -> bool:
 
 def spice_text(value: float) -> str:
     """A number in SPICE's notation: 3.5e-6 gives ``3.5u``, and 2e6 gives ``2meg``."""
-    text = format_si(value, "", 12).replace(" ", "")
-    return text.replace("M", "meg").replace("G", "g").replace("T", "t")
+    return format_si(value, "", 12).replace(" ", "").replace("M", "meg").replace("G", "g").replace("T", "t")
 
 
 def _power_of_ten(letters: str, text: str, as_written: str) -> int:

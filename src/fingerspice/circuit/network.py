@@ -30,7 +30,7 @@ from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of,
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
-from fingerspice.waveforms.waveform import Waveform
+from fingerspice.waveforms.waveform import Waveform, refuse
 
 # A current of a source that is this small, relative to what it is the difference of, is rounding.
 _ROUNDING = 1e-13
@@ -197,8 +197,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
         """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""
-        out = [potential[a] - potential[b] for a, b, *_ in pairs]
-        return np.array(out).reshape(len(pairs), sum(taken))
+        return np.array([potential[a] - potential[b] for a, b, *_ in pairs]).reshape(len(pairs), sum(taken))
 
     across, over_currents = rows([cell.nodes for cell in cells])[:, order], rows([e.nodes for e in currents])
     over_e, over_r = np.hsplit(rows([e.nodes for e in resistors]), [n_e])
@@ -367,8 +366,7 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
         known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
         raise InputError(f"finger is {finger!r}; allowed: the name of a GAP, {known}")
     network = network_of(circuit)
-    if not gaps:
-        raise InputError("a phasor solution needs a GAP; this circuit has none")
+    refuse(not gaps, "a phasor solution needs a GAP; this circuit has none")
     if len(network.sources) != 1:
         names = ", ".join(e.name for e in network.sources)
         raise InputError(f"a phasor solution needs one source, whose amplitude it takes; this circuit has {names}")

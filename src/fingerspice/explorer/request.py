@@ -22,20 +22,12 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.circuit import CHARGE_LAWS, nearest, number_from
-from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
-from fingerspice.circuit.devices import ParameterSpec
+from fingerspice.circuit.devices import FIRST_OF_SOURCES, MEANINGS, ParameterSpec
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import SLABS, count_of, driving_sources
 from fingerspice.netlist.netlist import source_from_text
 from fingerspice.waveforms.waveform import require
 
-#: Numbers of waveforms that the page shows at once; the others it shows on request.
-_FIRST_OF_SOURCES = (
-    *("amplitude", "frequency", "level", "v1", "v2", "carrier", "modulation", "depth", "f0", "f1", "duration"),
-    *("duty", "pulse_period", "period", "td1", "tau1", "td2", "tau2"),
-)
-#: Ends of sliders of values that are 0 in the deck.
-_FROM_ZERO = {"a_fix": 100.0, "tau": 0.1, "mu": 1.0, "c2": 20e3}
 #: A slider goes from the deck's value over this to its value times this, within the usual range.
 _SPAN = 100.0
 #: Ratio of the ends of a usual range up to which its slider is linear.
@@ -49,9 +41,8 @@ def sliders(base: fs.Circuit, shown: fs.Circuit) -> list[dict[str, Any]]:
     """Sliders by element, of sources, gap and layers first; values of the deck's `base` set the ranges, which stay."""
     driving = {e.name for e in driving_sources(shown)}
     before = {e.name: e for e in base.elements}
-    order = {"V": 0, "I": 0, "GAP": 1, "LAYER": 2, "SLAB": 2, "SKIN": 3, "SKIN_DISPERSIVE": 3}
     groups = []
-    for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4)):
+    for e in sorted(shown.elements, key=lambda e: e.spec.place):
         old, specs, found = before[e.name], {p.name: p for p in e.spec.parameters}, []
         for name, one in e.parameters.items():
             value, unit, spec = one.value, one.unit, specs.get(name)
@@ -63,7 +54,7 @@ def sliders(base: fs.Circuit, shown: fs.Circuit) -> list[dict[str, Any]]:
                 drives = e.name in driving
                 limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
                 unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
-                first, meaning = name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, "")
+                first, meaning = name in FIRST_OF_SOURCES, MEANINGS.get(name, "")
             found.append({
                 "path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
                 "text": value_text(value, unit), "low": limits[0], "high": limits[1], "log": limits[2],
@@ -87,7 +78,7 @@ def _of_parameter(spec: ParameterSpec, value: float) -> tuple[float, float, bool
     if not math.isfinite(value):
         return least, most, True
     if spec.may_be_zero:
-        return 0.0, (5.0 * value or _FROM_ZERO.get(spec.name, most)), False
+        return 0.0, (5.0 * value or spec.slider or most), False
     if most / least <= _LINEAR:
         return min(least, value), max(most, value), False
     low, high = max(least, value / _SPAN), min(most, value * _SPAN)
@@ -280,8 +271,7 @@ def _recording(given: Any) -> Recording:
         times = _numbers("times", given["times"])
         require(times.size == values.size, "recording", f"{times.size} times, {values.size} values", "as many of each")
         return Recording(name, values, times)
-    good = _is_number(rate) and 1.0 <= rate <= 1e7
-    require(good, "recording rate", repr(rate)[:80], "1 to 1e7 samples per second")
+    require(_is_number(rate) and 1.0 <= rate <= 1e7, "recording rate", repr(rate)[:80], "1 to 1e7 samples per second")
     return Recording(name, values, None, float(rate))
 
 
@@ -432,8 +422,7 @@ def _dispersive(circuit: fs.Circuit) -> fs.Circuit:
 
 
 def _unknown(kind: str, name: str, known: Iterable[str]) -> str:
-    near = nearest(name, list(known))
-    hint = "" if near is None else f"; nearest: {near!r}"
+    hint = "" if (near := nearest(name, list(known))) is None else f"; nearest: {near!r}"
     return f"unknown {kind} {_short(name)}, which is left out{hint}"
 
 

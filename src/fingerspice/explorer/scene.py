@@ -24,6 +24,7 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.explorer.request import MENUS, WAVEFORMS, Asked, quiet, read_source, sliders, text_of, value_text
 from fingerspice.plots.drawing import save
 from fingerspice.results.record import SIGNALS
+from fingerspice.waveforms.waveform import refuse
 
 #: Traces of each kind, and harmonics.
 MOST_TRACES, HARMONICS = 8, 20
@@ -90,8 +91,7 @@ def _noticing(answer: dict[str, Any]) -> Iterator[None]:
     with warnings.catch_warnings(record=True, action="ignore") as noticed:
         warnings.simplefilter("always", FingerspiceWarning)
         yield
-    said = [*answer.get("warnings", ()), *(str(w.message) for w in noticed)]
-    answer["warnings"] = list(dict.fromkeys(said))
+    answer["warnings"] = list(dict.fromkeys([*answer.get("warnings", ()), *(str(w.message) for w in noticed)]))
 
 
 def deadline() -> Callable[[float], None]:
@@ -365,8 +365,7 @@ def means(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any
         raise InputError("frequencies: allowed: a list of at most 16 numbers from 0.01 to 1e6 Hz")
     asked = Asked(given, own)
     gaps, wave = asked.circuit.by_device("GAP"), asked.waveform
-    if not gaps:
-        raise InputError("the circuit has no GAP, and so no force")
+    refuse(not gaps, "the circuit has no GAP, and so no force")
     if wave.fundamental is None:
         raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
     (found,) = fs.large_signal(

@@ -17,7 +17,7 @@ from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.expressions import Bare, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
-from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Statement, Subcircuit
+from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, OTHERS, Deck, Directive, Statement, Subcircuit
 from fingerspice.waveforms.waveform import refuse
 
 LONGEST_TITLE = 200  #: Characters of a title that are shown; the middle of a longer title is left out.
@@ -26,12 +26,6 @@ MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
-_ELSEWHERE = {
-    "A": "an XSPICE model", "D": "a diode", "K": "a coupled inductor", "L": "an inductor",
-    "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
-    **dict.fromkeys("EFGH", "a controlled source"), **dict.fromkeys("JMQZ", "a transistor"),
-    **dict.fromkeys("OTUY", "a transmission line"), **dict.fromkeys("SW", "a switch"),
-}  # fmt: skip
 _TITLE = re.compile(r"^\.title\s+", re.IGNORECASE)
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
 #: Titles that are probably the netlist's first statement.
@@ -233,6 +227,6 @@ def _unknown_element(lexemes: list[Lexeme]) -> str:
         return f"'{name}': a device's name begins with X, as in X{name}"
     if f".{name.lower()}" in DIRECTIVES:
         return f"'{name}': a directive begins with a dot, as in .{name.lower()}"
-    kind = _ELSEWHERE.get(name[0].upper())
+    kind = OTHERS["elements"].get(name[0].upper())
     what = f"'{name}' is {kind}, which is not supported" if kind else f"'{name}' is no known element"
     return f"{what}; elements are R, C, V, I, and X with {', '.join(layer_devices())} or a .subckt"

@@ -473,8 +473,7 @@ def definitions(line: Line, start: int) -> list[Assignment]:
         value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), line)
         if text[0] in "{'":
             closing = "}" if text[0] == "{" else "'"
-            known = closing in text[1:]
-            problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
+            problem = f"what follows {closing} belongs inside" if closing in text[1:] else f"{text[0]} is never closed"
             refuse(len(text) < 2 or text[-1] != closing, problem, value)
             value = value._replace(kind="expression", text=text[1:-1])
         out.append(Assignment(key, value))

@@ -8,6 +8,8 @@ from __future__ import annotations
 import codecs
 import re
 import sys
+import tomllib
+from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from encodings import cp1252
@@ -111,10 +113,9 @@ class Context:
                 path = folder / name.replace("\\", "/")
             self.size += path.stat().st_size if path.is_file() else 0
         except (OSError, RuntimeError) as error:  # a name that is too long, or the folder of an unknown user
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"'{name}' cannot be read: {reason}", where) from None
-        if self.size > MAX_SOURCE_BYTES:
-            raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
+            raise InputError(f"'{name}' cannot be read: {getattr(error, 'strerror', None) or error}", where) from None
+        most = f"{MAX_SOURCE_BYTES >> 20:,} MiB"
+        refuse(self.size > MAX_SOURCE_BYTES, f"the sources' files are larger than {most} in all", where)
         return path
 
 
@@ -178,28 +179,9 @@ def inside(root: Path, folder: Path, name: str, where: Where) -> Path:
 
 
 _GREEK_MU = re.compile(r"(?<![\w.])([0-9.]+(?:e[+-]?[0-9]+)?)μ", re.IGNORECASE)
-#: Directives that only other simulators know, each with the alternative here.
-ELSEWHERE = {
-    ".step": "give one value a run by --set PATH=VALUE, or loop over circuit.replace({path: value}) in Python",
-    ".four": "mean, peaks and amplitude are in the summary of a run, and any harmonic in the data that it writes",
-    ".temp": "nothing depends on temperature; give the values at the one that is meant",
-    ".model": "there are no models; write the device's parameters on its own line",
-    ".global": "give the node to each .subckt as one of its nodes",
-    ".func": "write the expression where it is used, {a*b}, or into .param",
-    ".op": "a .tran without uic starts from the operating point, fs.simulate(circuit, start='dc') too",
-    ".dc": "run once per value by --set, such as --set Vdrive.level=5",
-    ".noise": "there is no noise analysis",
-    ".wave": "run writes every signal as NetCDF, or as CSV with --csv",
-    ".csparam": "write .param",
-    ".endl": "put the section of the library into a file and .include it",
-    ".width": "leave it out",
-    **dict.fromkeys((".tf", ".pz", ".net"), "gains against frequency are given by fingerspice ac"),
-    **dict.fromkeys((".sens", ".data", ".alter"), "run once per value by --set"),
-    **dict.fromkeys((".if", ".elseif", ".else", ".endif"), "write the case that is meant"),
-    **dict.fromkeys(
-        (".savebias", ".loadbias"), "a run goes on from another in Python, fs.simulate(circuit, start=solution)"
-    ),
-}
+#: What only other simulators know: directives, each with the alternative here, elements, words of .tran, options.
+OTHERS = tomllib.loads(Path(__file__).with_name("elsewhere.toml").read_text(encoding="utf-8"))
+ELSEWHERE: Mapping[str, str] = OTHERS["directives"]
 MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000  #: Of all files: a word takes up to 500 bytes of memory, and a line 200.
 MAX_WARNINGS = 100  #: Largest number of warnings that are shown.
 MAX_INCLUDES = 1000
@@ -393,8 +375,7 @@ class Deck:
         ports: dict[str, None] = {}  # an ordered set
         for word in names[1:]:
             port = word.text.lower()
-            if port in ("0", "gnd"):
-                raise InputError("ground is the same node everywhere and cannot be a subcircuit's node", word.where)
+            refuse(port in ("0", "gnd"), "ground is the same node everywhere and cannot be a subcircuit's node", word)
             refuse(port in ports, f"node '{word.text}' is given twice", word)
             ports[port] = None
         defaults = list(words.params.values())

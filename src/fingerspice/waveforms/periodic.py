@@ -263,8 +263,7 @@ class _Periodic(Ramps):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        kind = type(self).__name__.lower()
-        require(self.frequency > 0.0, f"{kind} frequency", f"{self.frequency:g} Hz", "> 0")
+        require(self.frequency > 0.0, f"{type(self).__name__.lower()} frequency", f"{self.frequency:g} Hz", "> 0")
         period = 1.0 / self.frequency
         # Begin whole periods earlier, at or before t = 0: the delay shifts the shape, and holds nothing before it.
         shift = first = self.delay - self.phase_deg / 360.0 / self.frequency
@@ -497,7 +496,6 @@ class Repeat(_Stretches):
         self._declare(_stretch=self.period)
 
     def tone(self) -> float | None:
-        inside = self.waveform.waveform if isinstance(self.waveform, Burst) else self.waveform
-        tone = inside.tone()
+        tone = (self.waveform.waveform if isinstance(self.waveform, Burst) else self.waveform).tone()
         turns = 0.0 if tone is None else tone * self.period
         return tone if round(turns) >= 1 and abs(turns - round(turns)) < 1e-9 * turns else 1.0 / self.period
