@@ -167,7 +167,7 @@ _CELLS: Mapping[str, Cells] = {
 def _device(name: str, parameters: Iterable[dict[str, Any]] = (), **given: Any) -> DeviceSpec:
     """A device from its entry in the file."""
     specs = tuple(ParameterSpec(**{**one, "usual": _USUAL[one["usual"]]}) for one in parameters)
-    words = {key: tuple(value) if isinstance(value, list) else value for key, value in given.items()}
+    words: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in given.items()}
     return DeviceSpec(name, parameters=specs, cells=_CELLS.get(name), **words)
 
 
