@@ -389,8 +389,7 @@ class Scope:
             raise InputError(f"a number is needed, not the text {lexeme.written}", lexeme.where)
         value, expression = evaluated(lexeme.text, self._visible, lexeme.place), compiled(lexeme.text)
         mega = Token(expression.mega[0], lexeme.place(expression.mega[1])) if expression.mega else None
-        for name in expression.names:
-            mega = mega or self._mega.get(name)
+        mega = mega or next(filter(None, map(self._mega.get, expression.names)), None)
         return Number(value, lexeme.written, lexeme.where, mega)
 
     def references(self, lexeme: Lexeme) -> dict[str, float]:
