@@ -122,6 +122,5 @@ def mend_streams() -> None:
             os.open(os.devnull, os.O_RDWR)
     for number, name in ((1, "stdout"), (2, "stderr")):
         raw, encoding = _Raw(number, "w", closefd=False), getattr(getattr(sys, name), "encoding", None) or "utf-8"
-        lines = raw.isatty() or number == 2
-        mended = io.TextIOWrapper(io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=lines)
-        setattr(sys, name, mended)
+        buffer, lines = io.BufferedWriter(raw), raw.isatty() or number == 2
+        setattr(sys, name, io.TextIOWrapper(buffer, encoding, "backslashreplace", line_buffering=lines))

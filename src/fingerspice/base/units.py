@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 import re
 
+#: Types of numbers in a unit, and those units by the types' names.
+Volt = Hertz = Second = Degree = PerSecond = Ratio = float
+UNITS = {"Volt": "V", "Hertz": "Hz", "Second": "s", "Degree": "deg", "PerSecond": "1/s", "Ratio": ""}
 #: Power of ten of each scale suffix; the suffix `mil` (25.4e-6) is not a power of ten.
 SCALES = {"t": 12, "g": 9, "meg": 6, "k": 3, "m": -3, "u": -6, "µ": -6, "μ": -6, "n": -9, "p": -12, "f": -15}
 MIL = 25.4e-6
@@ -92,8 +95,7 @@ def exponent_and_scale(text: str) -> bool:
 
 def spice_text(value: float) -> str:
     """A number in SPICE's notation: 3.5e-6 gives ``3.5u``, and 2e6 gives ``2meg``."""
-    text = format_si(value, "", 12).replace(" ", "")
-    return text.replace("M", "meg").replace("G", "g").replace("T", "t")
+    return format_si(value, "", 12).replace(" ", "").replace("M", "meg").replace("G", "g").replace("T", "t")
 
 
 def _power_of_ten(letters: str, text: str, as_written: str) -> int:

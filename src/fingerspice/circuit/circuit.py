@@ -18,7 +18,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.pages import Page, Shown
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.devices import DEVICES, DeviceSpec, check, concerns, mega_note, unit_trap, unusual_of_changed
-from fingerspice.waveforms.waveform import Waveform, as_waveform, require
+from fingerspice.waveforms.waveform import Waveform, as_waveform, refuse, require
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
@@ -333,19 +333,24 @@ def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[E
     elif (text := given.strip()).lower() in ("inf", "none"):
         value = math.inf
     else:
-        try:
-            value = parse_number(text)
-        except ValueError as error:
-            raise InputError(f"{path}: {error}") from None
+        value = number_from(path, text)
         if spec is not None:
-            if trap := unit_trap(spec, text):
-                raise InputError(f"{path} {trap}")
+            trap = unit_trap(spec, text)
+            refuse(trap, f"{path} {trap}")
             note = mega_note(text, value, spec)
     told = f"{path}: {note}" if note else None
     if spec is not None:
         return dataclasses.replace(element, values=MappingProxyType({**element.values, parameter: value})), told
     waveform = dataclasses.replace(element.waveform, **{parameter: value})  # type: ignore[type-var]
     return dataclasses.replace(element, waveform=waveform), told
+
+
+def number_from(what: str, text: str) -> float:
+    """The number in a text, in SPICE's notation; `what` it is begins the message where it is none."""
+    try:
+        return parse_number(text.strip())
+    except ValueError as error:
+        raise InputError(f"{what}: {error}") from None
 
 
 def _unknown(kind: str, given: str, known: list[str]) -> str:

@@ -21,7 +21,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.devices import shown, unusual_of_changed
+from fingerspice.circuit.devices import MEANINGS, shown, unusual_of_changed
 from fingerspice.circuit.network import network_of, with_skin_held
 from fingerspice.circuit.statespace import build_stack, driving, driving_sources, shared
 from fingerspice.physics.materials import SKIN_BAND
@@ -66,11 +66,6 @@ def digests(circuit: Circuit) -> tuple[str, str]:
     return elements.hexdigest(), sources.hexdigest()
 
 
-#: What the numbers of waveforms are, in few words.
-MEANINGS_OF_WAVEFORMS = {
-    "modulation": "envelope", "phase_deg": "phase", "f0": "first frequency", "f1": "last frequency", "v1": "low level",
-    "v2": "high level", "td1": "rise begins", "tau1": "rise constant", "td2": "fall begins", "tau2": "fall constant",
-}  # fmt: skip
 # Largest number of changes, or of sources, that one line names, and of elements that a circuit's page lists.
 _MOST, _MOST_ELEMENTS = 8, 25
 
@@ -78,7 +73,7 @@ _MOST, _MOST_ELEMENTS = 8, 25
 def meaning_of(circuit: Circuit, path: str) -> str:
     """A parameter in words, as in ``load of Xgap``."""
     name, _, parameter = path.rpartition(".")
-    known = MEANINGS_OF_WAVEFORMS | {p.name: p.meaning for p in circuit[name].spec.parameters}
+    known = MEANINGS | {p.name: p.meaning for p in circuit[name].spec.parameters}
     return f"{known.get(parameter, parameter)} of {name}"
 
 
@@ -180,8 +175,7 @@ def values_text(element: Element) -> str:
 
 
 def _joined(said: list[str]) -> str:
-    more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
-    return ", ".join([*said[:_MOST], *more])
+    return ", ".join([*said[:_MOST], *([f"and {len(said) - _MOST} more"] if len(said) > _MOST else [])])
 
 
 #: A waveform, a constant (V, or A of a current source), or a function of time (s).
@@ -217,8 +211,8 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
     named = {name.lower() for name in sources}
     on = [e.name for e in driving if e.name.lower() not in named and e.waveform not in (None, DC(0.0))]
     if on and any(e.name.lower() in named for e in driving):
-        text = f"sources names {', '.join(sources)} only: {', '.join(on)} stays on, as in the deck"
-        text += "; 0 would switch it off"
+        stays = f"{', '.join(on)} stays on, as in the deck; 0 would switch it off"
+        text = f"sources names {', '.join(sources)} only: {stays}"
         warnings.warn(text, FingerspiceWarning, stacklevel=3)
         circuit = dataclasses.replace(circuit, warnings=(*circuit.warnings, text))
     return circuit.replace({circuit[name].name: value for name, value in sources.items()})

@@ -1,4 +1,4 @@
-"""The devices of netlists: one entry per device, with its nodes, its parameters, and for a layer its cells.
+"""The devices of netlists: one entry per device in `devices.toml`, with its nodes and its parameters; a layer's cells.
 
 A parameter has its unit, its default, and its legal and usual range; a value outside the usual one is warned about. The
 reader, runs, phasors and the export use the entry alone. For ngspice a layer also needs a subcircuit of the same name,
@@ -9,9 +9,11 @@ entry with the subcircuits.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -72,7 +74,7 @@ class ParameterSpec:
     """One parameter of a device, in the unit of the netlist."""
 
     name: str
-    unit: str
+    unit: str = ""
     default: float | None = None  # None for a parameter that the netlist must give
     usual: Usual | None = None  # Range outside which a warning is given
     meaning: str = ""  # What it is, in few words, beside its slider
@@ -82,6 +84,7 @@ class ParameterSpec:
     # Range of all other numbers: wide enough for any device, and so narrow that products and quotients do not overflow
     least: float = 1e-30
     most: float = 1e30
+    slider: float | None = None  # Upper end of the slider of a value that is 0 in the deck
 
     def allowed(self) -> str:
         """The allowed values in words."""
@@ -90,8 +93,7 @@ class ParameterSpec:
 
     def accepts(self, value: float) -> bool:
         """Whether a value is in range."""
-        special = {0.0: self.may_be_zero, math.inf: self.may_be_infinite}
-        return special.get(value, self.least <= value <= self.most)
+        return {0.0: self.may_be_zero, math.inf: self.may_be_infinite}.get(value, self.least <= value <= self.most)
 
     def unusual(self, element: str, value: float) -> str | None:
         """The warning about a value outside the usual range, or None."""
@@ -110,6 +112,7 @@ class DeviceSpec:
     aliases: tuple[str, ...] = ()  # Other names of the value
     beside: tuple[str, ...] = ()  # LTspice's parasitics, which become elements: rser in series, all others in parallel
     data: tuple[str, ...] = ()  # Data of a part that LTspice and Qucs-S write and no calculation uses
+    place: int = 4  # Among the explorer's sliders
 
     def __post_init__(self) -> None:
         if self.is_layer != (self.cells is not None):
@@ -145,91 +148,31 @@ def _dispersive_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
     return _cells(np.divide.outer(EPS0 * eps_r, v["d"]), 0.0, 1.0 / np.multiply.outer(rho, v["d"]))
 
 
-# Usual ranges, each with its source.
+_DATA = tomllib.loads(Path(__file__).with_name("devices.toml").read_text(encoding="utf-8"))
+_USUAL, SOURCES, MEASURED = (
+    {name: Usual(**one) for name, one in _DATA[table].items()} for table in ("usual", "sources", "measured")
+)
+"""Usual ranges by name, of sources by the unit of the parameter, and of measured values by the signal."""
+_USUAL["skin_band"] = Usual(*SKIN_BAND, "where the data of Eqs. 18 and 19 were measured")
+#: Usual ranges of the area of a finger's ridges, mm^2, and of the amplitude (V) under which forces are measured.
+REST_AREA, MEASURING = _USUAL["rest_area"], _USUAL["measuring"]
+#: What the numbers of waveforms are, in few words, where their names do not say it; those that the page shows at once.
+MEANINGS, FIRST_OF_SOURCES = _DATA["waveforms"]["meanings"], _DATA["waveforms"]["first"]
+_CELLS: Mapping[str, Cells] = {
+    "LAYER": _layer_cells, "SLAB": _layer_cells, "GAP": _layer_cells,
+    "SKIN": _skin_cells, "SKIN_DISPERSIVE": _dispersive_cells,
+}  # fmt: skip
 
-_COATING = Usual(10e-9, 1e-2, "from a sputtered film to a thick glass")
-_SKIN = Usual(1e-6, 2e-3, "skin has 10 um, a fingertip 0.2 to 0.6 mm, callus over 1 mm")
-# Below 10 nm surfaces attract each other, and above 100 um the ridges (some 60 um high) do not touch the screen.
-_AIR = Usual(10e-9, 100e-6, "from van der Waals contact to ridges off the screen; 3.5 um in Table 1")
-_EPS_R = Usual(1.0, 1e4, "air has 1, polymers 2 to 10, ceramics up to some thousand")
-_EPS_R_MATERIAL = Usual(1.0, 1e6, "polymers have 2 to 10, skin at low frequencies up to 1e5")
-# Sweat in the gap: some ohm m, a few um, 35 mm^2; a good polymer: 1e14 ohm m at 100 um.
-_LEAK = Usual(1.0, 1e15, "0.2 to 1 megohm in Table 1, an ohm for sweat, 1e14 ohm for a good polymer")
-_RHO = Usual(0.1, 1e17, "sweat has 1 ohm m, skin 1e4, good polymers 1e14 to 1e16")
-_STRENGTH = Usual(1e5, 1e10, "air has 3 MV/m, thin oxides 1 GV/m", "V/m, not V/um")
-# Fingers press with less than 50 N: a value of 50 is probably meant in millinewton.
-_LOAD = Usual(1e-3, 49.9, "a finger touches with 0.1 to 5 N", "newton, not millinewton")
-_FRICTION = Usual(0.01, 5.0, "dry skin on glass has 0.1 to 1, moist skin up to 3")
-_ALPHA = Usual(1.0, 2000.0, "the ridge area at 1 N; 54.4 in Table 1", "mm^2 and N")
-# Table 1 has 5000: at a friction force of 0.15 N, c2 F_T^2 is then a tenth of the square of a fingertip's area.
-_C2 = Usual(1.0, 1e6, "5000 in Table 1", "mm^4/N^2")
-_TAU = Usual(1e-5, 60.0, "skin creeps within 1 ms to some seconds")
-_BAND = Usual(*SKIN_BAND, "where the data of Eqs. 18 and 19 were measured")
-_OHM = Usual(1e-3, 1e15, "a lead has milliohms, an insulator up to 1e15 ohm")
-_FARAD = Usual(1e-16, 1e-2, "a body has 150 pF to ground, a supply's capacitor some mF")
-#: Area of a finger's ridges on the screen, mm^2; Table 1 has 35.
-REST_AREA = Usual(0.1, 2000.0, "a fingertip has 20 to 400, a palm some 1000", "mm^2, not m^2")
 
-#: Usual ranges of sources, by the unit of the parameter. Screens for electrovibration take 10 to 400 V, electroadhesive
-#: grippers some kV. The skin feels up to 1 kHz; carriers have up to some 100 kHz, where the skin's data end.
-SOURCES = {
-    "V": Usual(0.0, 10e3, "screens take up to 400 V, grippers some kV"),
-    "Hz": Usual(10e-3, 10e6, "a finger feels up to 1 kHz, carriers have up to some 100 kHz"),
-}
+def _device(name: str, parameters: Iterable[dict[str, Any]] = (), **given: Any) -> DeviceSpec:
+    """A device from its entry in the file."""
+    specs = tuple(ParameterSpec(**{**one, "usual": _USUAL[one["usual"]]}) for one in parameters)
+    words: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in given.items()}
+    return DeviceSpec(name, parameters=specs, cells=_CELLS.get(name), **words)
 
-#: Usual ranges of the largest of several measured values, by the signal: a finger's, pressed on with up to some N.
-MEASURED = {
-    "f_el": Usual(1e-6, 10.0, "a finger is pulled with up to 1 N", "newton, not millinewton"),
-    "f_t": Usual(1e-3, 50.0, "a finger rubs with 0.01 to 10 N", "newton, not millinewton"),
-    "area": Usual(0.1e-6, 2e-3, "a fingertip has 20 to 400 mm^2", "m^2, not mm^2"),
-}
-#: Usual range of the largest amplitude (V) under which forces, friction and areas are measured.
-MEASURING = Usual(1.0, 10e3, "forces are measured at 10 V to some kV", "volt, not kilovolt")
-
-_P = ParameterSpec
-_LAYER_NODES, _ENDS = ("p", "n", "area"), ("p", "n")
-_THICKNESS, _SKIN_THICKNESS = (_P("d", "m", None, usual, "thickness", first=True) for usual in (_COATING, _SKIN))
-_EPS = [_P("eps_r", "", None, usual, "permittivity", first=True) for usual in (_EPS_R, _EPS_R_MATERIAL)]
-_RESISTIVITY = _P("rho", "ohm m", None, _RHO, "resistivity", first=True, may_be_infinite=True)
-_TAKEN_AT = _P("f", "Hz", None, _BAND, "data taken at", first=True, least=1e-3, most=1e9)
-_R = _P("r", "ohm", math.inf, _LEAK, "leak resistance", first=True, may_be_infinite=True)
-_E_MAX = _P("e_max", "V/m", math.inf, _STRENGTH, "dielectric strength", may_be_infinite=True)
-_DEVICES = (
-    DeviceSpec("LAYER", _LAYER_NODES, (_THICKNESS, _EPS[0], _R, _E_MAX), _layer_cells, "layer"),
-    DeviceSpec("SLAB", _LAYER_NODES, (_THICKNESS, _EPS[1], _RESISTIVITY, _E_MAX), _layer_cells, "layer"),
-    DeviceSpec("SKIN", _LAYER_NODES, (_SKIN_THICKNESS, _TAKEN_AT), _skin_cells, "skin"),
-    DeviceSpec("SKIN_DISPERSIVE", _LAYER_NODES, (_SKIN_THICKNESS,), _dispersive_cells, "skin, dispersive"),
-    DeviceSpec(
-        # The defaults are Table 1's, and equal those of the ngspice libraries.
-        "GAP", _LAYER_NODES, (
-            _P("d", "m", 3.5e-6, _AIR, "gap height", first=True),
-            _P("eps_r", "", 1.0, _EPS_R, "permittivity"),
-            _R,
-            _P("fn", "N", 0.5, _LOAD, "load", first=True),
-            _P("mu", "", 0.3, _FRICTION, "friction coeff.", first=True, may_be_zero=True),
-            _P("alpha", "mm^2/N^m", 54.4, _ALPHA, "area at 1 N"),
-            _P("m_exp", "", 0.52, Usual(0.1, 1.0, "2/3 for a ball, 1 for a rough plane, 0.52 in Table 1"), "load exp."),
-            _P("beta", "mm^(2-n)", 32.0, Usual(0.3, 1e4, "pi for a full disc, 32 in Table 1", "mm"), "area at 1 mm"),
-            _P("n_exp", "", 1.41, Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1"), "indent exp."),
-            _P("c2", "mm^4/N^2", 5000.0, _C2, "friction loss", may_be_zero=True),
-            _P("a_fix", "mm^2", 0.0, REST_AREA, "fixed area", may_be_zero=True),
-            _P("tau", "s", 0.0, _TAU, "area lag", may_be_zero=True),
-        ), _layer_cells, "gap and contact",
-    ),
-    DeviceSpec(
-        "R", _ENDS, (_P("value", "ohm", None, _OHM, "resistance", first=True),), None, "resistor",
-        ("r", "resistance"), (), ("tol", "pwr", "tc1", "tc2"),
-    ),
-    DeviceSpec(
-        "C", _ENDS, (_P("value", "F", None, _FARAD, "capacitance", first=True),), None, "capacitor",
-        ("c", "capacitance"), ("rser", "rpar", "cpar"), ("tol", "v", "irms", "mfg", "pn", "type", "tc1", "tc2"),
-    ),
-    DeviceSpec("V", _ENDS, (), what="voltage source", beside=("rser", "cpar")),
-    DeviceSpec("I", _ENDS, (), what="current source"),
-)  # fmt: skip
 
 #: Every device that the reader knows, by name.
-DEVICES = {spec.name: spec for spec in _DEVICES}
+DEVICES = {one["name"]: _device(**one) for one in _DATA["device"]}
 
 
 def layer_devices() -> tuple[str, ...]:

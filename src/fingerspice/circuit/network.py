@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import count, pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of,
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
-from fingerspice.waveforms.waveform import Waveform
+from fingerspice.waveforms.waveform import Waveform, refuse
 
 # A current of a source that is this small, relative to what it is the difference of, is rounding.
 _ROUNDING = 1e-13
@@ -197,8 +197,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
         """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""
-        out = [potential[a] - potential[b] for a, b, *_ in pairs]
-        return np.array(out).reshape(len(pairs), sum(taken))
+        return np.array([potential[a] - potential[b] for a, b, *_ in pairs]).reshape(len(pairs), sum(taken))
 
     across, over_currents = rows([cell.nodes for cell in cells])[:, order], rows([e.nodes for e in currents])
     over_e, over_r = np.hsplit(rows([e.nodes for e in resistors]), [n_e])
@@ -298,7 +297,7 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
         stack = build_stack(circuit, skin_at)
         network = shared(circuit, ("loop network", skin_at), lambda: loop_network(stack))
-        return replace(network, sources=(_source(stack),), stack=stack)
+        return replace(network, sources=(replace(network.sources[0], waveform=stack.waveform),), stack=stack)
 
     return circuit.remember(("network", skin_at), make)
 
@@ -306,13 +305,9 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
 def checked(circuit: Circuit) -> Circuit:
     """The circuit, refused if a value is not allowed or it has no solution."""
     check(circuit)
-    network_of(circuit)
+    # Of a stack the network follows from its cells, and cannot fail.
+    (build_stack if statespace.is_stack(circuit) else network_of)(circuit)
     return circuit
-
-
-def _source(stack: Stack) -> Element:
-    """The voltage around a stack's loop."""
-    return Element("loop", "V", ("1", "0"), ("1", "0"), MappingProxyType({}), stack.waveform)
 
 
 def loop_network(stack: Stack) -> Network:
@@ -329,27 +324,22 @@ def loop_network(stack: Stack) -> Network:
     across = np.zeros((n + 1, n + 1 + several))
     across[:n, :n] = np.eye(n)
     across[n, :n], across[n, n] = -sign[n] * sign[:n], sign[n]
-    rows, row, layer, source = list[FloatArray](), np.zeros(across.shape[1]), 0, n + 1
-    for hop in stack.hops[:-1]:
-        if hop.element.device != "V":
-            row = row - hop.sign * across[of_layer == layer].sum(axis=0)
-            layer += 1
-        elif several:
-            row[source] -= hop.sign
-            source += 1
-        else:
-            row[n] += 1.0
-        rows.append(row.copy())
+    layer, source, one = count(), count(n + (several > 0)), np.eye(across.shape[1])
+    drops = [
+        hop.sign * (one[next(source)] if hop.element.device == "V" else across[of_layer == next(layer)].sum(axis=0))
+        for hop in stack.hops[:-1]
+    ]
     gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
     cells = [Cell(stack.layers[i], ("1", "0"), 0, *own) for i, own in zip(of_layer, constants, strict=True)]
+    around = Element("loop", "V", ("1", "0"), ("1", "0"), MappingProxyType({}), stack.waveform)
     return Network(
-        sources=(_source(stack),), n_voltage=1, cells=tuple(cells), layers=stack.layers, live=tuple(range(n)),
+        sources=(around,), n_voltage=1, cells=tuple(cells), layers=stack.layers, live=tuple(range(n)),
         areas=(Area(stack.layers[0].nodes[2], gap, stack.area_given),), contacts=(stack.contact,),
         gaps=(None if stack.gap is None else order.index(stack.gap),),
         p=across[:, :n].copy(), q=across[:, n : n + 1].copy(), k=np.zeros((n, n)), b=np.zeros((n, 1)),
         through=(sign * slowest)[None], delivered=np.zeros((1, n + 1)),
         resistor_factor=np.zeros((0, n)), resistor_factor_s=np.zeros((0, 1)),
-        node_names=tuple(hop.node for hop in stack.hops[:-1]), nodes=np.array(rows).reshape(-1, row.size), stack=stack,
+        node_names=tuple(hop.node for hop in stack.hops[:-1]), nodes=0.0 - np.cumsum(drops, axis=0), stack=stack,
     )  # fmt: skip
 
 
@@ -376,8 +366,7 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
         known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
         raise InputError(f"finger is {finger!r}; allowed: the name of a GAP, {known}")
     network = network_of(circuit)
-    if not gaps:
-        raise InputError("a phasor solution needs a GAP; this circuit has none")
+    refuse(not gaps, "a phasor solution needs a GAP; this circuit has none")
     if len(network.sources) != 1:
         names = ", ".join(e.name for e in network.sources)
         raise InputError(f"a phasor solution needs one source, whose amplitude it takes; this circuit has {names}")

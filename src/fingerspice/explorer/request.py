@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import math
 import re
+import tomllib
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -19,21 +21,13 @@ import fingerspice as fs
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number, spice_text
-from fingerspice.circuit.circuit import CHARGE_LAWS, nearest
-from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
-from fingerspice.circuit.devices import ParameterSpec
+from fingerspice.circuit.circuit import CHARGE_LAWS, nearest, number_from
+from fingerspice.circuit.devices import FIRST_OF_SOURCES, MEANINGS, ParameterSpec
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import SLABS, count_of, driving_sources
 from fingerspice.netlist.netlist import source_from_text
 from fingerspice.waveforms.waveform import require
 
-#: Numbers of waveforms that the page shows at once; the others it shows on request.
-_FIRST_OF_SOURCES = (
-    *("amplitude", "frequency", "level", "v1", "v2", "carrier", "modulation", "depth", "f0", "f1", "duration"),
-    *("duty", "pulse_period", "period", "td1", "tau1", "td2", "tau2"),
-)
-#: Ends of sliders of values that are 0 in the deck.
-_FROM_ZERO = {"a_fix": 100.0, "tau": 0.1, "mu": 1.0, "c2": 20e3}
 #: A slider goes from the deck's value over this to its value times this, within the usual range.
 _SPAN = 100.0
 #: Ratio of the ends of a usual range up to which its slider is linear.
@@ -47,23 +41,20 @@ def sliders(base: fs.Circuit, shown: fs.Circuit) -> list[dict[str, Any]]:
     """Sliders by element, of sources, gap and layers first; values of the deck's `base` set the ranges, which stay."""
     driving = {e.name for e in driving_sources(shown)}
     before = {e.name: e for e in base.elements}
-    order = {"V": 0, "I": 0, "GAP": 1, "LAYER": 2, "SLAB": 2, "SKIN": 3, "SKIN_DISPERSIVE": 3}
     groups = []
-    for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4)):
+    for e in sorted(shown.elements, key=lambda e: e.spec.place):
         old, specs, found = before[e.name], {p.name: p for p in e.spec.parameters}, []
         for name, one in e.parameters.items():
             value, unit, spec = one.value, one.unit, specs.get(name)
             if spec is not None:
                 limits, first, meaning = _of_parameter(spec, old.values.get(name, value)), spec.first, spec.meaning
-            elif isinstance(value, (int, float)):
+            else:
                 own = getattr(old.waveform, name) if type(old.waveform) is type(e.waveform) else value
                 # A source that does not drive is on an area node, and gives mm^2.
                 drives = e.name in driving
                 limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
                 unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
-                first, meaning = name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, "")
-            else:
-                continue
+                first, meaning = name in FIRST_OF_SOURCES, MEANINGS.get(name, "")
             found.append({
                 "path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
                 "text": value_text(value, unit), "low": limits[0], "high": limits[1], "log": limits[2],
@@ -87,7 +78,7 @@ def _of_parameter(spec: ParameterSpec, value: float) -> tuple[float, float, bool
     if not math.isfinite(value):
         return least, most, True
     if spec.may_be_zero:
-        return 0.0, (5.0 * value or _FROM_ZERO.get(spec.name, most)), False
+        return 0.0, (5.0 * value or spec.slider or most), False
     if most / least <= _LINEAR:
         return min(least, value), max(most, value), False
     low, high = max(least, value / _SPAN), min(most, value * _SPAN)
@@ -130,31 +121,16 @@ class Argument(NamedTuple):
     optional: bool = False
 
 
-def _usual(name: str, value: float, unit: str = "Hz", *, optional: bool = False) -> Argument:
-    """An argument with the range that it has as a parameter of a source."""
-    return Argument(name, unit, value, *_of_waveform(name, unit, value), optional)
+def _argument(name: str, value: float, unit: str = "", **given: Any) -> Argument:
+    """An argument, with the range that it has as a parameter of a source unless the menu gives its own."""
+    own = dict(zip(("low", "high", "log"), _of_waveform(name, unit, value), strict=True))
+    return Argument(name, unit, value, **{**own, **given})
 
 
-_AMPLITUDE, _FREQUENCY = _usual("amplitude", 200.0, "V"), _usual("frequency", 100.0)
+#: The page's menus, of waveforms and of scenes.
+MENUS = tomllib.loads(Path(__file__).with_name("menus.toml").read_text(encoding="utf-8"))
 #: By function: its name on the page, and its numbers in their order.
-WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
-    "SIN": ("Sine", (_usual("offset", 0.0, "V"), _AMPLITUDE, _FREQUENCY)),
-    "SQUARE": ("Square wave", (_AMPLITUDE, _FREQUENCY, _usual("duty", 0.5, "", optional=True))),
-    "TRIANGLE": ("Triangle", (_AMPLITUDE, _FREQUENCY)),
-    "SAWTOOTH": ("Sawtooth", (_AMPLITUDE, _FREQUENCY)),
-    "AM": ("Carrier with envelope",
-           (_AMPLITUDE, _usual("carrier", 5e3), _usual("envelope", 50.0), _usual("depth", 1.0, "", optional=True))),
-    "BURST": ("Bursts", (_AMPLITUDE, _usual("frequency", 5e3), Argument("cycles", "", 10.0, 1.0, 100.0),
-                         Argument("every", "s", 10e-3, 1e-3, 1.0, True))),
-    "CHIRP": ("Chirp", (_usual("amplitude", 150.0, "V"), _usual("from", 20.0), _usual("to", 1e3),
-                        Argument("duration", "s", 0.05, 1e-2, 3.0, True))),
-    "EXP": ("Step that rises and falls",
-            (_usual("low", 0.0, "V"), _usual("high", 200.0, "V"), Argument("start", "s", 1e-3, 0.0, 0.05),
-             Argument("rise", "s", 1e-3, 1e-5, 0.1, True), Argument("end", "s", 20e-3, 0.0, 0.1),
-             Argument("fall", "s", 2e-3, 1e-5, 0.1, True))),
-    RECORDING: ("Recording or table, dropped here", (Argument("gain", "V", 150.0, 0.0, 400.0),)),
-    "DC": ("Constant", (_usual("level", 200.0, "V"),)),
-}  # fmt: skip
+WAVEFORMS = {x["kind"]: (x["title"], tuple(_argument(**one) for one in x["arguments"])) for x in MENUS["waveform"]}
 #: Waveforms that the page can say as text; their numbers are those of the menu, one of them by another name.
 _TEXTS = {"Sine": "SIN", "Square": "SQUARE", "Triangle": "TRIANGLE", "Sawtooth": "SAWTOOTH", "AM": "AM", "DC": "DC"}
 _FIELDS = {"envelope": "modulation"}
@@ -188,10 +164,7 @@ def read_source(
             return name, source_from_text(said, circuit, files=False), None
     words = recorded[1].replace(",", " ").split()
     require(len(words) == 1, RECORDING, f"given {len(words)} numbers", f"{RECORDING}(gain)")
-    try:
-        gain = parse_number(words[0])
-    except ValueError as error:
-        raise InputError(f"{RECORDING}: {error}") from None
+    gain = number_from(RECORDING, words[0])
     if recording is None:
         raise InputError("the source is a recording, which a link does not carry; allowed: drop its file on the page")
     return name, recording.waveform(gain), gain
@@ -283,10 +256,7 @@ def _read(name: str, given: Any) -> Any:
 def _override(path: str, value: Any) -> float:
     if isinstance(value, str) and value.strip().lower() == "inf":
         return math.inf
-    try:
-        number = parse_number(value.strip()) if isinstance(value, str) else value
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
+    number = number_from(path, value) if isinstance(value, str) else value
     require(_is_number(number), _short(path), _short(value), "a number, or text such as 3.5u")
     return float(number)
 
@@ -301,8 +271,7 @@ def _recording(given: Any) -> Recording:
         times = _numbers("times", given["times"])
         require(times.size == values.size, "recording", f"{times.size} times, {values.size} values", "as many of each")
         return Recording(name, values, times)
-    good = _is_number(rate) and 1.0 <= rate <= 1e7
-    require(good, "recording rate", repr(rate)[:80], "1 to 1e7 samples per second")
+    require(_is_number(rate) and 1.0 <= rate <= 1e7, "recording rate", repr(rate)[:80], "1 to 1e7 samples per second")
     return Recording(name, values, None, float(rate))
 
 
@@ -453,8 +422,7 @@ def _dispersive(circuit: fs.Circuit) -> fs.Circuit:
 
 
 def _unknown(kind: str, name: str, known: Iterable[str]) -> str:
-    near = nearest(name, list(known))
-    hint = "" if near is None else f"; nearest: {near!r}"
+    hint = "" if (near := nearest(name, list(known))) is None else f"; nearest: {near!r}"
     return f"unknown {kind} {_short(name)}, which is left out{hint}"
 
 

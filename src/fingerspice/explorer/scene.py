@@ -6,7 +6,6 @@ import dataclasses
 import math
 import re
 import time
-import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,9 +21,10 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Element, Tran
 from fingerspice.circuit.describe import in_force, remembering
 from fingerspice.circuit.statespace import driving_sources
-from fingerspice.explorer.request import WAVEFORMS, Asked, quiet, read_source, sliders, text_of, value_text
+from fingerspice.explorer.request import MENUS, WAVEFORMS, Asked, quiet, read_source, sliders, text_of, value_text
 from fingerspice.plots.drawing import save
 from fingerspice.results.record import SIGNALS
+from fingerspice.waveforms.waveform import refuse
 
 #: Traces of each kind, and harmonics.
 MOST_TRACES, HARMONICS = 8, 20
@@ -91,8 +91,7 @@ def _noticing(answer: dict[str, Any]) -> Iterator[None]:
     with warnings.catch_warnings(record=True, action="ignore") as noticed:
         warnings.simplefilter("always", FingerspiceWarning)
         yield
-    said = [*answer.get("warnings", ()), *(str(w.message) for w in noticed)]
-    answer["warnings"] = list(dict.fromkeys(said))
+    answer["warnings"] = list(dict.fromkeys([*answer.get("warnings", ()), *(str(w.message) for w in noticed)]))
 
 
 def deadline() -> Callable[[float], None]:
@@ -366,8 +365,7 @@ def means(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any
         raise InputError("frequencies: allowed: a list of at most 16 numbers from 0.01 to 1e6 Hz")
     asked = Asked(given, own)
     gaps, wave = asked.circuit.by_device("GAP"), asked.waveform
-    if not gaps:
-        raise InputError("the circuit has no GAP, and so no force")
+    refuse(not gaps, "the circuit has no GAP, and so no force")
     if wave.fundamental is None:
         raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
     (found,) = fs.large_signal(
@@ -394,8 +392,7 @@ class Example(NamedTuple):
     asked: Mapping[str, object] = {}  # Further keys of the request, as in `scene`
 
 
-_FILE = Path(__file__).with_name("examples.toml")
-EXAMPLES = tuple(Example(**one) for one in tomllib.loads(_FILE.read_text(encoding="utf-8"))["scene"])
+EXAMPLES = tuple(Example(**one) for one in MENUS["scene"])
 """The scenes of the menu, the first of which is shown at the start."""
 
 
@@ -442,8 +439,9 @@ def decks(folder: Path) -> Iterator[Entry]:
 
 def scenes() -> Iterator[Entry]:
     """The example scenes of the explorer."""
+    menus = Path(__file__).with_name("menus.toml")
     for one in EXAMPLES:
-        yield Entry(f"scene-{one.name}", one.title, one.note, _FILE, partial(_run_scene, one))
+        yield Entry(f"scene-{one.name}", one.title, one.note, menus, partial(_run_scene, one))
 
 
 def _run_scene(example: Example) -> fs.Solution:

@@ -1,7 +1,7 @@
 """A netlist file as a flat list of evaluated statements: expands subcircuit calls, renames nodes, evaluates values.
 
 A statement has a name, nodes and values; `netlist` and `sources` give it a meaning. The steps are those of `lexer`
-(from text to words), `reader` (lines by kind, included files), `expressions` (parameters and values) and `Flattener`
+(from text to words), `reader` (lines by kind, included files), `expressions` (parameters and values) and `_Instance`
 (subcircuit calls). Every error has its place in the file.
 """
 
@@ -17,7 +17,7 @@ from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.expressions import Bare, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
-from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Reader, Statement, Subcircuit
+from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, OTHERS, Deck, Directive, Statement, Subcircuit
 from fingerspice.waveforms.waveform import refuse
 
 LONGEST_TITLE = 200  #: Characters of a title that are shown; the middle of a longer title is left out.
@@ -26,12 +26,6 @@ MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
-_ELSEWHERE = {
-    "A": "an XSPICE model", "D": "a diode", "K": "a coupled inductor", "L": "an inductor",
-    "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
-    **dict.fromkeys("EFGH", "a controlled source"), **dict.fromkeys("JMQZ", "a transistor"),
-    **dict.fromkeys("OTUY", "a transmission line"), **dict.fromkeys("SW", "a switch"),
-}  # fmt: skip
 _TITLE = re.compile(r"^\.title\s+", re.IGNORECASE)
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
 #: Titles that are probably the netlist's first statement.
@@ -51,23 +45,22 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
     refuse(not text.strip("\ufeff \t\r\n"), f"'{deck.file}' is empty: a netlist begins with a title line")
     refuse(len(text) > MAX_BYTES, f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
     refuse("\0" in text, f"'{deck.file}' is not text (it holds NUL characters)")
-    reader = Reader(deck)
-    title, *lines = reader.split(text.removeprefix("\ufeff"))
+    title, *lines = deck.split(text.removeprefix("\ufeff"))
     deck.title = printable(_TITLE.sub("", title.strip()), LONGEST_TITLE)
     if _STATEMENT.match(deck.title):
         problem = f"the first line is the title, but '{deck.title}' reads like a statement: add a title above"
-        reader.warn(problem, Where(deck.file, 1))
+        deck.warn(problem, Where(deck.file, 1))
     try:
-        reader.read_deck(lines)
-        scope = Scope(reader.root.params)
+        deck.read_lines(lines)
+        scope = Scope(deck.root.params)
         deck.params = scope.solve()
-        Flattener(deck).expand(_Instance(reader.root, scope))
+        _Instance(deck, deck.root, scope).expand()
     except InputError as error:
         raise with_comma(error, deck.warnings) from None
-    for defined in reader.root.inner.values():
+    for defined in deck.root.inner.values():
         # In a library it is usual that some subcircuits are never called.
         if defined.where.file == deck.file and not (defined.called or defined.skipped):
-            reader.warn(f"subcircuit '{defined.name}' is never called, and its body was not read", defined.where)
+            deck.warn(f"subcircuit '{defined.name}' is never called, and its body was not read", defined.where)
     return deck
 
 
@@ -80,8 +73,9 @@ def with_comma(error: InputError, warnings: Iterable[str]) -> InputError:
 
 @dataclass(slots=True)
 class _Instance:
-    """A subcircuit call that is being expanded, or the deck itself."""
+    """A subcircuit call that is being expanded into statements and directives of the deck, or the deck itself."""
 
+    deck: Deck
     definition: Subcircuit
     scope: Scope
     around: tuple[_Instance, ...] = ()  # Those around the definition, innermost first, whose subcircuits it may call
@@ -103,30 +97,21 @@ class _Instance:
                 raise InputError(f"{word.written} stands where a node's name belongs", word.where)
         return [self.node(word.text) for word in words]
 
-
-class Flattener:
-    """Turns the lines of a deck, its subcircuit calls expanded, into statements and directives of the flat circuit."""
-
-    def __init__(self, deck: Deck) -> None:
-        self.deck = deck
-        self._names: dict[str, Where] = {}
-        self._expanded = self._expanded_text = 0
-
-    def expand(self, instance: _Instance) -> None:
-        """Add the statements and directives of a call; an `.ic` line gets the canonical names of its nodes."""
-        for line in instance.definition.elements:
-            self._element(line, instance)
-        for name, line, rest in instance.definition.directives:
+    def expand(self) -> None:
+        """Add the statements and directives; an `.ic` line gets the canonical names of its nodes."""
+        for line in self.definition.elements:
+            self._element(line)
+        for name, line, rest in self.definition.directives:
             words, params = group(lex(line, rest), probes=True), dict[str, Value]()
-            args = instance.scope.words(words.words)
-            for key, value in instance.scope.pairs(words).items():
+            args = self.scope.words(words.words)
+            for key, value in self.scope.pairs(words).items():
                 probe = name == ".ic" and key.startswith("v(")
-                flat = f"v({instance.node(key[2:-1].strip())[0]})" if probe else key
+                flat = f"v({self.node(key[2:-1].strip())[0]})" if probe else key
                 refuse(flat in params, f".ic gives node {flat[2:-1]!r} twice", value.key)
                 params[flat] = value
             self.deck.directives.append(Directive(name, args, params, line.where(), line.text))
 
-    def _element(self, line: Line, instance: _Instance) -> None:
+    def _element(self, line: Line) -> None:
         lexemes = lex(line) or [Lexeme("", ",", 0, line)]  # a line of commas has none
         first = lexemes[0]
         where, letter = first.where, first.text[:1].upper()
@@ -135,27 +120,27 @@ class Flattener:
             raise InputError(problem, where)
         if letter != "X" and letter not in DEVICES:
             raise InputError(_unknown_element(lexemes), where)
-        name = f"{instance.prefix}{first.text}"
+        name = f"{self.prefix}{first.text}"
         if len(name) > MAX_NAME:
             raise InputError(f"an element's name of {len(name)} characters: at most {MAX_NAME} are allowed", where)
-        earlier = self._names.setdefault(name.lower(), where)
-        refuse(earlier is not where, f"element '{name}' is defined twice, first at {earlier}", where)
+        if (earlier := self.deck.names.setdefault(name.lower(), where)) is not where:
+            raise InputError(f"element '{name}' is defined twice, first at {earlier}", where)
         if letter == "X":
-            self._call(name, lexemes, instance)
+            self._call(name, lexemes)
             return
-        scope, words = instance.scope, group(lexemes[1:], plain=2)
+        scope, words = self.scope, group(lexemes[1:], plain=2)
         nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
         missing = "node" if len(nodes) < 2 else "" if len(words.words) > 2 or words.params else "value"
         refuse(missing, f"missing {missing}: a {DEVICES[letter].what} is written {name} node node value", where)
-        canonical, written = zip(*instance.nodes(nodes), strict=True)
+        canonical, written = zip(*self.nodes(nodes), strict=True)
         # A word of a resistor or capacitor names a parameter, those of a source are keywords (DC, SIN).
         bare: Bare = "name" if letter in "RC" else "nothing"
         body, params = scope.words(words.words[2:], bare), scope.pairs(words, bare)
         self.deck.statements.append(Statement(name, letter, canonical, written, body, params, where))
 
-    def _call(self, name: str, lexemes: list[Lexeme], instance: _Instance) -> None:
+    def _call(self, name: str, lexemes: list[Lexeme]) -> None:
         """An X line: a native device becomes a statement, and a subcircuit is expanded."""
-        words, scope = group(lexemes[1:], plain=len(lexemes)), instance.scope
+        words, scope = group(lexemes[1:], plain=len(lexemes)), self.scope
         if (stray := words.stray) is not None:
             number = stray.line.text[: stray.position].rpartition("=")[2].strip()
             apart = NUMBER.fullmatch(number) and is_unit(stray.text)
@@ -167,22 +152,24 @@ class Flattener:
         *nodes, device = plain
         refuse(device.kind != "word", f"{device.written} stands where a device's name belongs", device)
         native, key = device.text.upper(), device.text.lower()
-        around = tuple(dropwhile(lambda one: key not in one.definition.inner, (instance, *instance.around)))
+        around = tuple(dropwhile(lambda one: key not in one.definition.inner, (self, *self.around)))
         called = around[0].definition.inner[key] if around else None
         if called is None and native not in layer_devices():
-            raise InputError(_unknown_device(plain, instance), device.where)
+            raise InputError(_unknown_device(plain, self), device.where)
         shown, wanted = (called.name, called.ports) if called else (native, DEVICES[native].nodes)
-        count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}" + (f" ({' '.join(wanted)})" if wanted else "")
-        refuse(len(nodes) != len(wanted), f"{name}: {shown} has {count}, {len(nodes)} given", device)
+        if len(nodes) != len(wanted):
+            count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}"
+            named = f" ({' '.join(wanted)})" if wanted else ""
+            raise InputError(f"{name}: {shown} has {count}{named}, {len(nodes)} given", device.where)
         if called is None:
-            canonical, written = zip(*instance.nodes(nodes), strict=True)
+            canonical, written = zip(*self.nodes(nodes), strict=True)
             params = scope.pairs(words, bare="arithmetic")
             given = {key: value.value for key, value in params.items() if isinstance(value, Number)}
             _refuse_captured(native, given, words, scope)
             self.deck.statements.append(Statement(name, native, canonical, written, (), params, lexemes[0].where))
             return
-        self._count(called, instance, device.where)
-        ports = dict(zip(called.ports, instance.nodes(nodes), strict=True))
+        self._count(called, device)
+        ports = dict(zip(called.ports, self.nodes(nodes), strict=True))
         called.called = True
         # Values on the X line are evaluated in the caller's scope, defaults in the subcircuit's.
         inner = Scope((*called.defaults, *called.params), scope)
@@ -193,20 +180,20 @@ class Flattener:
                 raise InputError(f"subcircuit '{called.name}' has no parameter '{word.text}'{hint}", word.where)
             inner.preset(parameter, scope.number(value))
         _refuse_captured(called.name, inner.solve(), words, scope)
-        self.expand(_Instance(called, inner, around, f"{name}.", ports, (*instance.calls, called)))
+        _Instance(self.deck, called, inner, around, f"{name}.", ports, (*self.calls, called)).expand()
 
-    def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
+    def _count(self, called: Subcircuit, device: Lexeme) -> None:
         """Count what a call expands to; refuse circles, and what is too deep or too much."""
-        for start, outer in enumerate(instance.calls):
+        for start, outer in enumerate(self.calls):
             if outer is called:
-                path = " -> ".join(sub.name for sub in (*instance.calls[start:], called))
-                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
-        self._expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
-        self._expanded_text += called.characters
-        refuse(len(instance.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", where)
-        refuse(self._expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
-        if self._expanded_text > MAX_EXPANDED_TEXT:
-            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
+                path = " -> ".join(sub.name for sub in (*self.calls[start:], called))
+                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", device.where)
+        self.deck.expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
+        self.deck.expanded_text += called.characters
+        refuse(len(self.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", device)
+        refuse(self.deck.expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", device)
+        problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
+        refuse(self.deck.expanded_text > MAX_EXPANDED_TEXT, problem, device)
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:
@@ -240,6 +227,6 @@ def _unknown_element(lexemes: list[Lexeme]) -> str:
         return f"'{name}': a device's name begins with X, as in X{name}"
     if f".{name.lower()}" in DIRECTIVES:
         return f"'{name}': a directive begins with a dot, as in .{name.lower()}"
-    kind = _ELSEWHERE.get(name[0].upper())
+    kind = OTHERS["elements"].get(name[0].upper())
     what = f"'{name}' is {kind}, which is not supported" if kind else f"'{name}' is no known element"
     return f"{what}; elements are R, C, V, I, and X with {', '.join(layer_devices())} or a .subckt"

@@ -389,8 +389,7 @@ class Scope:
             raise InputError(f"a number is needed, not the text {lexeme.written}", lexeme.where)
         value, expression = evaluated(lexeme.text, self._visible, lexeme.place), compiled(lexeme.text)
         mega = Token(expression.mega[0], lexeme.place(expression.mega[1])) if expression.mega else None
-        for name in expression.names:
-            mega = mega or self._mega.get(name)
+        mega = mega or next(filter(None, map(self._mega.get, expression.names)), None)
         return Number(value, lexeme.written, lexeme.where, mega)
 
     def references(self, lexeme: Lexeme) -> dict[str, float]:
@@ -473,8 +472,7 @@ def definitions(line: Line, start: int) -> list[Assignment]:
         value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), line)
         if text[0] in "{'":
             closing = "}" if text[0] == "{" else "'"
-            known = closing in text[1:]
-            problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
+            problem = f"what follows {closing} belongs inside" if closing in text[1:] else f"{text[0]} is never closed"
             refuse(len(text) < 2 or text[-1] != closing, problem, value)
             value = value._replace(kind="expression", text=text[1:-1])
         out.append(Assignment(key, value))

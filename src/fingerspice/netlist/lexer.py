@@ -222,8 +222,7 @@ def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Gro
                 inside.stray = lexeme
             inside.words.append(lexeme)
         index = after
-    if brackets:
-        raise InputError("'(' is never closed", brackets[-1][0].where)
+    refuse(brackets, "'(' is never closed", brackets[-1][0] if brackets else None)
     return top
 
 
@@ -255,7 +254,7 @@ def _probe(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int] | None:
 
 def _assign(inside: Group, key: Lexeme, following: list[Lexeme]) -> None:
     """Enter the pair `key = value`, given up to two of the lexemes after its `=`."""
-    name, where, problem = key.text.lower(), key.where, ""
+    name, place, problem = key.text.lower(), key, ""
     kinds = [lexeme.kind for lexeme in following]
     if key.kind not in ("word", "probe") or (key.kind == "word" and not _KEY.fullmatch(key.text)):
         problem = f"{key.written} cannot be a parameter's name: letters, digits and _ are allowed"
@@ -263,8 +262,8 @@ def _assign(inside: Group, key: Lexeme, following: list[Lexeme]) -> None:
         problem = f"'{key.text}' is given twice, first at {inside.params[name].key.where}"
     elif kinds[:1] == ["("] or kinds == ["word", "("]:
         problem = f"the value of '{key.text}' holds brackets: arithmetic goes in braces, as in {{(a + b)*2}}"
-        where = following[0].where
+        place = following[0]
     elif not kinds or kinds[0] in (")", "=") or kinds == ["word", "="]:
         problem = f"missing value of '{key.text}'"
-    refuse(problem, problem, where)
+    refuse(problem, problem, place)
     inside.params[name] = Assignment(key, following[0])

@@ -19,25 +19,13 @@ from fingerspice.circuit.network import checked
 from fingerspice.netlist.deck import parse_deck, with_comma
 from fingerspice.netlist.expressions import Call, Number, Token, Value, number
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
-from fingerspice.netlist.reader import MAX_WARNINGS, Context, Deck, Directive, Statement, text_of
+from fingerspice.netlist.reader import MAX_WARNINGS, OTHERS, Context, Deck, Directive, Statement, text_of
 from fingerspice.netlist.sources import read_source
 from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
 
 _COPIES = "m"  #: The parameter that gives the number of equal parts in parallel.
 LTSPICE_OUTPUTS = 10_000  #: Number of outputs of a run whose .tran has no TSTEP.
-_LTSPICE_START = {
-    "startup": "sources are not ramped up here; allowed: a source that rises by itself, such as PWL(0 0 20u 5)",
-    "steady": "no run stops by itself here; allowed: fs.steady_state(circuit), which finds the periodic state",
-    "nodiscard": "outputs begin at TSTART here; allowed: TSTART left out",
-    "step": "loads are not stepped here; allowed: a source with steps, PULSE or PWL",
-}
-_NGSPICE_OPTIONS = """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5
-    itl6 keepopinfo klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter
-    numdgt opts pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol
-    trytocompact vntol warn xmu""".split()  # noqa: SIM905
-_LTSPICE_OPTIONS = """baudrate cshunt delay fastaccess flagloads gfloat gshunt measdgt meascplxfmt minclockguide
-    mindeltagmin nomarch noopiter plotabstol plotreltol plotvntol plotwinsize ptranmax ptrantau srcstepmethod sstol
-    thev_induc topologycheck""".split()  # noqa: SIM905
+_NGSPICE_OPTIONS, _LTSPICE_OPTIONS = (OTHERS["options"][name].split() for name in ("ngspice", "ltspice"))
 
 
 def read_netlist(path: str | Path) -> Circuit:
@@ -280,8 +268,8 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
     usage = ".tran TSTEP TSTOP [TSTART [TMAX]] [uic]"
     numbers, words = _numbers(directive, usage)
     for word in words:
-        if word in _LTSPICE_START:
-            raise InputError(f".tran {word}: {_LTSPICE_START[word]}", directive.where)
+        if word in OTHERS["tran"]:
+            raise InputError(f".tran {word}: {OTHERS['tran'][word]}", directive.where)
     apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
     problem = f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}"
     refuse(any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4, problem, directive)

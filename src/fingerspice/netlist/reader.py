@@ -8,6 +8,8 @@ from __future__ import annotations
 import codecs
 import re
 import sys
+import tomllib
+from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from encodings import cp1252
@@ -19,20 +21,9 @@ from typing import NamedTuple
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import Tran
 from fingerspice.circuit.devices import layer_devices
+from fingerspice.netlist import lexer
 from fingerspice.netlist.expressions import Value, Word, definitions
-from fingerspice.netlist.lexer import (
-    SPLIT,
-    Assignment,
-    Lexeme,
-    Line,
-    closest,
-    decimal_comma,
-    group,
-    lex,
-    logical_lines,
-    nearest,
-    split_lines,
-)
+from fingerspice.netlist.lexer import Assignment, Lexeme, Line, decimal_comma, group, lex, logical_lines, nearest
 from fingerspice.waveforms.files import file_fault
 from fingerspice.waveforms.waveform import refuse
 
@@ -122,10 +113,9 @@ class Context:
                 path = folder / name.replace("\\", "/")
             self.size += path.stat().st_size if path.is_file() else 0
         except (OSError, RuntimeError) as error:  # a name that is too long, or the folder of an unknown user
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"'{name}' cannot be read: {reason}", where) from None
-        if self.size > MAX_SOURCE_BYTES:
-            raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
+            raise InputError(f"'{name}' cannot be read: {getattr(error, 'strerror', None) or error}", where) from None
+        most = f"{MAX_SOURCE_BYTES >> 20:,} MiB"
+        refuse(self.size > MAX_SOURCE_BYTES, f"the sources' files are larger than {most} in all", where)
         return path
 
 
@@ -136,8 +126,8 @@ def library_changed(root: Path, folder: Path, name: str) -> bool:
         if not path.is_relative_to(root) or not path.is_file():
             return False
         own = library_text(next(law for law, file in LIBRARIES.items() if file == path.name.lower()))
-        read, shipped = ([line.rstrip() for line in split_lines(x.rstrip())] for x in (read_text(path, name), own))
-        return read != shipped
+        lines = ([line.rstrip() for line in lexer.split_lines(x.rstrip())] for x in (read_text(path, name), own))
+        return next(lines) != next(lines)
     except (OSError, ValueError, RuntimeError):
         return True  # A file that cannot be read is not this version's library.
 
@@ -157,7 +147,7 @@ def _similar_file(path: Path, shown: str, root: Path | None) -> str:
     found = _nearest_path(folder, below) or _nearest_path(folder, below[-1:])
     # A library of native devices is built in and need not exist in the folder: propose it, too.
     names = [*([found[-1]] if found else []), *(LIBRARIES.values() if root is not None else ())]
-    if found is not None and closest(path.name, names) in (found[-1], None):
+    if found is not None and lexer.closest(path.name, names) in (found[-1], None):
         return f"; did you mean '{PurePath(*written, *found).as_posix()}'?"
     return nearest(path.name, names)
 
@@ -170,7 +160,7 @@ def _nearest_path(folder: Path, parts: list[str]) -> list[str] | None:
             entries = [e.name for e in folder.joinpath(*found).iterdir() if e.is_dir() == (number < len(parts))]
         except OSError:
             return None
-        name = part if part in entries else closest(part, sorted(entries))
+        name = part if part in entries else lexer.closest(part, sorted(entries))
         if name is None:
             return None
         found.append(name)
@@ -189,28 +179,9 @@ def inside(root: Path, folder: Path, name: str, where: Where) -> Path:
 
 
 _GREEK_MU = re.compile(r"(?<![\w.])([0-9.]+(?:e[+-]?[0-9]+)?)μ", re.IGNORECASE)
-#: Directives that only other simulators know, each with the alternative here.
-ELSEWHERE = {
-    ".step": "give one value a run by --set PATH=VALUE, or loop over circuit.replace({path: value}) in Python",
-    ".four": "mean, peaks and amplitude are in the summary of a run, and any harmonic in the data that it writes",
-    ".temp": "nothing depends on temperature; give the values at the one that is meant",
-    ".model": "there are no models; write the device's parameters on its own line",
-    ".global": "give the node to each .subckt as one of its nodes",
-    ".func": "write the expression where it is used, {a*b}, or into .param",
-    ".op": "a .tran without uic starts from the operating point, fs.simulate(circuit, start='dc') too",
-    ".dc": "run once per value by --set, such as --set Vdrive.level=5",
-    ".noise": "there is no noise analysis",
-    ".wave": "run writes every signal as NetCDF, or as CSV with --csv",
-    ".csparam": "write .param",
-    ".endl": "put the section of the library into a file and .include it",
-    ".width": "leave it out",
-    **dict.fromkeys((".tf", ".pz", ".net"), "gains against frequency are given by fingerspice ac"),
-    **dict.fromkeys((".sens", ".data", ".alter"), "run once per value by --set"),
-    **dict.fromkeys((".if", ".elseif", ".else", ".endif"), "write the case that is meant"),
-    **dict.fromkeys(
-        (".savebias", ".loadbias"), "a run goes on from another in Python, fs.simulate(circuit, start=solution)"
-    ),
-}
+#: What only other simulators know: directives, each with the alternative here, elements, words of .tran, options.
+OTHERS = tomllib.loads(Path(__file__).with_name("elsewhere.toml").read_text(encoding="utf-8"))
+ELSEWHERE: Mapping[str, str] = OTHERS["directives"]
 MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000  #: Of all files: a word takes up to 500 bytes of memory, and a line 200.
 MAX_WARNINGS = 100  #: Largest number of warnings that are shown.
 MAX_INCLUDES = 1000
@@ -218,7 +189,7 @@ MAX_INCLUDE_DEPTH = 32
 
 _USED = tuple(".tran .ac .options .ic .param .subckt .ends .include .inc .lib .control .end".split())  # noqa: SIM905
 _UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
-#: Every directive that may stand in a deck; `Reader._direct` says what is done with it.
+#: Every directive that may stand in a deck; `Deck._direct` says what is done with it.
 DIRECTIVES = (*_USED, ".option", *_UNUSED, ".nodeset", ".backanno", ".endc")
 
 
@@ -244,31 +215,6 @@ class Statement(NamedTuple):
     where: Where  # Place of the name
 
 
-@dataclass
-class Deck:
-    """A netlist, into which `Reader` and `deck.Flattener` enter what they find."""
-
-    text: str
-    path: Path | None  # Path of the file; None for a text
-    title: str = ""  # The first line in printable characters (see `errors.printable`)
-    statements: list[Statement] = field(default_factory=list)  # In the order of the file, subcircuit calls expanded
-    directives: list[Directive] = field(default_factory=list)  # Those with values
-    libraries: list[str] = field(default_factory=list)  # Included files of native devices, without folder; not read
-    files: list[Path] = field(default_factory=list)  # The other included files, which were read
-    unused: dict[str, None] = field(default_factory=dict)  # Ordered set of the directives without effect here
-    warnings: list[str] = field(default_factory=list)  # About what is probably not meant, each with its place
-    params: dict[str, float] = field(default_factory=dict)  # The deck's own parameters by lower-case name
-
-    @property
-    def file(self) -> str:
-        """The file's name as shown to the user."""
-        return "<netlist>" if self.path is None else str(self.path)
-
-    def named(self, name: str) -> list[Directive]:
-        """The directives of that name."""
-        return [directive for directive in self.directives if directive.name == name]
-
-
 @dataclass(slots=True)
 class Subcircuit:
     """The definition of a subcircuit, or, without a name, the deck itself."""
@@ -287,29 +233,51 @@ class Subcircuit:
     characters: int = 0  # number of characters of its lines
 
 
-class Reader:
-    """Collects the lines of a deck and of the files it includes, which must be in the folder of its path."""
+@dataclass
+class Deck:
+    """A netlist: its lines, and those of the files that it includes from the folder of its path, sorted."""
 
-    def __init__(self, deck: Deck) -> None:
-        self.deck = deck
-        self.root = Subcircuit("", Where(deck.file, 1))
-        self._folder = None if deck.path is None else deck.path.parent.resolve()
+    text: str
+    path: Path | None  # Path of the file; None for a text
+    title: str = ""  # The first line in printable characters (see `errors.printable`)
+    statements: list[Statement] = field(default_factory=list)  # In the order of the file, subcircuit calls expanded
+    directives: list[Directive] = field(default_factory=list)  # Those with values
+    libraries: list[str] = field(default_factory=list)  # Included files of native devices, without folder; not read
+    files: list[Path] = field(default_factory=list)  # The other included files, which were read
+    unused: dict[str, None] = field(default_factory=dict)  # Ordered set of the directives without effect here
+    warnings: list[str] = field(default_factory=list)  # About what is probably not meant, each with its place
+    params: dict[str, float] = field(default_factory=dict)  # The deck's own parameters by lower-case name
+
+    def __post_init__(self) -> None:
+        self.root = Subcircuit("", Where(self.file, 1))
+        self._folder = None if self.path is None else self.path.parent.resolve()
         self._open = [self.root]
         self._control: Line | None = None
         self._ended = False
         self._reading: list[Path] = []
         self._size = self._lines = self._words = 0
+        self.names: dict[str, Where] = {}  # Place of each element, by its name in lower case
+        self.expanded = self.expanded_text = 0  # Lines and characters of the subcircuit calls expanded
+
+    @property
+    def file(self) -> str:
+        """The file's name as shown to the user."""
+        return "<netlist>" if self.path is None else str(self.path)
+
+    def named(self, name: str) -> list[Directive]:
+        """The directives of that name."""
+        return [directive for directive in self.directives if directive.name == name]
 
     def split(self, text: str, where: Where | None = None) -> list[str]:
         """Physical lines of the deck or of an included file; refuses more than `MAX_LINES` lines in all."""
         self._lines += 1 + text.count("\n") + text.count("\r")
         problem = f"the netlist has {self._lines:,} lines; allowed: {MAX_LINES:,}, included files counted"
         refuse(self._lines > MAX_LINES, problem, where or self.root.where)
-        return split_lines(text)
+        return lexer.split_lines(text)
 
-    def read_deck(self, lines: list[str]) -> None:
+    def read_lines(self, lines: list[str]) -> None:
         """Read the deck's own lines after the title."""
-        for line in logical_lines(lines, self.deck.file, first=2):
+        for line in logical_lines(lines, self.file, first=2):
             if self._ended:
                 self.warn("text after .end is not read", line.where())
                 break
@@ -320,7 +288,7 @@ class Reader:
 
     def warn(self, message: str, where: Where) -> None:
         """Keep a warning with its place, unless there are many already."""
-        kept = self.deck.warnings
+        kept = self.warnings
         if len(kept) == MAX_WARNINGS:
             message = f"more warnings than {MAX_WARNINGS}: the others are not shown"
         if len(kept) <= MAX_WARNINGS:
@@ -333,7 +301,7 @@ class Reader:
             if word == ".endc":
                 self._control = None
             return
-        self._words += len(line.parts) + sum(1 for _ in islice(SPLIT.finditer(line.text), MAX_WORDS))
+        self._words += len(line.parts) + sum(1 for _ in islice(lexer.SPLIT.finditer(line.text), MAX_WORDS))
         if self._words > MAX_WORDS:
             problem = f"the netlist has more than {MAX_WORDS:,} words and brackets; allowed: no more"
             raise InputError(f"{problem}, samples go in by Python: fs.Samples(values, rate)", line.where())
@@ -375,14 +343,14 @@ class Reader:
                 self._include(name, line, rest)
             case ".control":
                 self._control = line
-                self.deck.unused[name] = None
+                self.unused[name] = None
             case ".end":
                 refuse(self._reading, "only the netlist itself, not an included file, has .end", place)
                 self._ended = True
             case ".endc":
                 raise InputError(".endc without a .control before it", place)
             case _ if name in _UNUSED:
-                self.deck.unused[name] = None
+                self.unused[name] = None
             case _ if name in (".nodeset", ".backanno"):
                 pass  # These matter only to other simulators.
             case _ if name != ".global" or not set(text.lower().split()) <= {"gnd", "0"}:
@@ -407,8 +375,7 @@ class Reader:
         ports: dict[str, None] = {}  # an ordered set
         for word in names[1:]:
             port = word.text.lower()
-            if port in ("0", "gnd"):
-                raise InputError("ground is the same node everywhere and cannot be a subcircuit's node", word.where)
+            refuse(port in ("0", "gnd"), "ground is the same node everywhere and cannot be a subcircuit's node", word)
             refuse(port in ports, f"node '{word.text}' is given twice", word)
             ports[port] = None
         defaults = list(words.params.values())
@@ -435,23 +402,23 @@ class Reader:
         folder = self._reading[-1].parent if self._reading else self._folder
         base = name.replace("\\", "/").rpartition("/")[2]
         if base.lower() in LIBRARIES.values():
-            self.deck.libraries.append(base)
+            self.libraries.append(base)
             if self._folder is not None and folder is not None and library_changed(self._folder, folder, name):
                 problem = "differs from this version's and is not read: the devices are built in here, and only ngspice"
                 self.warn(f"'{name}' {problem} would run the changed ones", where)
             return
-        if folder is None or self._folder is None or self.deck.path is None:
+        if folder is None or self._folder is None or self.path is None:
             raise InputError(f"'{name}' cannot be included: a netlist given as text has no folder to look in", where)
         path = inside(self._folder, folder, name, where)
-        refuse(path in (self.deck.path.resolve(), *self._reading), f"'{name}' includes itself", where)
-        self.deck.files.append(path)
+        refuse(path in (self.path.resolve(), *self._reading), f"'{name}' includes itself", where)
+        self.files.append(path)
         problem = f"too many included files: at most {MAX_INCLUDES}, nested {MAX_INCLUDE_DEPTH} deep"
-        refuse(len(self.deck.files) > MAX_INCLUDES or len(self._reading) >= MAX_INCLUDE_DEPTH, problem, where)
+        refuse(len(self.files) > MAX_INCLUDES or len(self._reading) >= MAX_INCLUDE_DEPTH, problem, where)
         text = read_text(path, name, where, self._folder)
         self._size += len(text)
         refuse(self._size > MAX_BYTES, f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
         self._reading.append(path)
-        shown = str(Path(self.deck.file).parent / path.relative_to(self._folder))
+        shown = str(Path(self.file).parent / path.relative_to(self._folder))
         for included in logical_lines(self.split(text, where), shown):
             self._take(included)
         self._reading.pop()

@@ -86,8 +86,7 @@ class _Arguments:
 def _sin(a: _Arguments) -> Waveform:
     tran = a.context.tran
     frequency = a.get("FREQ", 1.0 / tran.stop if tran else math.nan)
-    if math.isnan(frequency):
-        raise InputError("SIN leaves out FREQ, which defaults to 1/TSTOP, and there is no .tran line", a.call.where)
+    refuse(math.isnan(frequency), "SIN leaves out FREQ, which defaults to 1/TSTOP, and there is no .tran line", a.call)
     return Sine(a.get("VA"), frequency, a.get("VO"), a.get("PHASE", 0.0), a.get("TD", 0.0), a.get("THETA", 0.0))
 
 
@@ -126,8 +125,7 @@ def _wavefile(a: _Arguments) -> Waveform:
     if "gain" not in a.words:
         a.refuse(f"{a.name} has no gain, the V at full scale")
     small = not path.is_file() or path.stat().st_size <= _KEPT_BYTES
-    gain = number(a.words["gain"], "gain").value
-    return a.upsampled(Samples.from_wav(path, gain, a.whole("channel"), at_once=small))
+    return a.upsampled(Samples.from_wav(path, number(a.words["gain"], "gain").value, a.whole("channel"), at_once=small))
 
 
 def _table(a: _Arguments) -> Waveform:

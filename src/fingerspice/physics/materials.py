@@ -1,22 +1,11 @@
-"""Electrical properties of stratum corneum against frequency (Eqs. 18, 19).
+"""Electrical properties of stratum corneum against frequency (Eqs. 18, 19), and materials as passive ladders.
 
-Equation 18 is damaged in print: z^3 stands twice. The reading used here is the cubic
-
-    rho_sc = 10^(-0.023 z^3 + 0.0795 z^2 - 0.2133 z + 4.9229) Ohm m,   z = log10(f / Hz).
-
-It is the reading that causality asks for: resistivity and permittivity of one passive material are one
-function (Kramers-Kronig), and of all exponent triples 1..6 the cubic agrees best with Eq. 19.
-
-Dispersive materials as passive ladders: what a permittivity that falls with frequency is in the time domain.
-
-A sum of Debye terms with no negative weight,
+Of Eq. 18, in which z^3 stands twice, the cubic is read (docs/theory/model.md says why):
+rho_sc = 10^(-0.023 z^3 + 0.0795 z^2 - 0.2133 z + 4.9229) ohm m, z = log10(f / Hz). A ladder is a sum of Debye terms,
 
     y(s) = g0 + s eps0 eps_inf + sum over j of s k_j / (s + p_j)      S/m,
 
-is causal and passive: a resistor, a capacitor and series RC branches side by side. Seen from its two ends it is the
-same as cells in series, each a resistor beside a capacitor (Foster's first form; the poles of an RC impedance are
-real, simple and negative, its residues positive): a layer of it is a stack of slabs, and takes part in a circuit as
-these do, whatever the area and either charge law.
+with no negative weight: causal and passive, and equal to slabs in series, each a resistor beside a capacitor (Foster).
 """
 
 from __future__ import annotations
@@ -24,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
 
@@ -38,35 +27,13 @@ _RHO = (-0.023, 0.0795, -0.2133, 4.9229)
 _EPS = (-0.00286, 0.03564, -0.15785, 0.33963, -0.6235, 4.1598)
 
 
-def skin_resistivity(frequency: ArrayLike) -> NDArray[np.float64]:
-    """Resistivity of stratum corneum (Eq. 18, cubic reading).
-
-    Parameters
-    ----------
-    frequency : array_like
-        Frequency in Hz, positive.
-
-    Returns
-    -------
-    ndarray
-        Resistivity in Ohm m, shape of `frequency`.
-    """
+def skin_resistivity(frequency: ArrayLike) -> FloatArray:
+    """Resistivity of stratum corneum (Eq. 18, cubic reading), ohm m, at frequencies in Hz, which are positive."""
     return np.asarray(10.0 ** np.polyval(_RHO, np.log10(np.asarray(frequency, float))))
 
 
-def skin_permittivity(frequency: ArrayLike) -> NDArray[np.float64]:
-    """Relative permittivity of stratum corneum (Eq. 19).
-
-    Parameters
-    ----------
-    frequency : array_like
-        Frequency in Hz, positive.
-
-    Returns
-    -------
-    ndarray
-        Relative permittivity, shape of `frequency`.
-    """
+def skin_permittivity(frequency: ArrayLike) -> FloatArray:
+    """Relative permittivity of stratum corneum (Eq. 19) at frequencies in Hz, which are positive."""
     return np.asarray(10.0 ** np.polyval(_EPS, np.log10(np.asarray(frequency, float))))
 
 
@@ -97,12 +64,7 @@ class Ladder:
     def cells(self) -> tuple[FloatArray, FloatArray]:
         """The same material as slabs in series, each as thick as the layer.
 
-        Returns
-        -------
-        eps_r : ndarray, shape (n + 1,)
-            Relative permittivities for n poles.
-        rho : ndarray, shape (n + 1,)
-            Resistivities, ohm m.
+        They are given by their relative permittivities and resistivities (ohm m), shape (n + 1,) each for n poles.
         """
         p, k, c = np.array(self.poles), np.array(self.weights), EPS0 * self.eps_inf
         # Zeros of y: the rates at which an open layer comes to rest.

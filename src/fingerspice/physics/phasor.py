@@ -15,16 +15,9 @@ from fingerspice.base.arrays import ComplexArray
 
 
 def layer_gains(admittance: ArrayLike) -> ComplexArray:
-    """Complex share of the source voltage across each layer (Eq. 11 before the modulus).
+    """Complex share of the source voltage across each layer (Eq. 11 before the modulus), shape (..., n_layer).
 
-    Parameters
-    ----------
-    admittance : array_like of complex, shape (..., n_layer)
-        1/Z_x = 1/R_x + i Omega C_x (Eq. 9), S. Zero is an open layer: it takes all the voltage.
-
-    Returns
-    -------
-    ndarray of complex, shape (..., n_layer)
+    The admittances are 1/Z_x = 1/R_x + i Omega C_x (Eq. 9), S; of an open layer it is 0: it takes all the voltage.
     """
     y = np.asarray(admittance, complex)
     # Impedances scaled by the smallest admittance: an open layer then needs no infinity.
@@ -38,19 +31,9 @@ def layer_gains(admittance: ArrayLike) -> ComplexArray:
 def coupled_area(area_of: Callable[[float], float], gain_of: Callable[[float], float], amplitude: float) -> float:
     """Area A = g(U_gap / sqrt 2), coupled through the mean stress and iterated to rounding (m^2).
 
-    Parameters
-    ----------
-    area_of : callable
-        g: gap voltage (V) to ridge contact area (m^2).
-    gain_of : callable
-        Area (m^2) to |U_gap / U_0| (Eq. 11).
-    amplitude : float
-        U_0, V.
-
-    Notes
-    -----
-    The gain lies between 0 and 1, so the root of u - U_0 |gain(g(u / sqrt 2))| is bracketed by 0 and U_0. Where the
-    area answers strongly, iterating on it would swing between two values for ever.
+    It follows from g, gap voltage (V) to ridge contact area (m^2), from `gain_of`, area (m^2) to |U_gap / U_0| (Eq.
+    11), and from the amplitude U_0 (V). The gain lies between 0 and 1, so the root of u - U_0 |gain(g(u / sqrt 2))| is
+    bracketed by 0 and U_0. Where the area answers strongly, iterating on it would swing between two values for ever.
     """
     lo, hi, before = 0.0, abs(amplitude), math.inf
     u = hi

@@ -151,8 +151,7 @@ def read_text_columns(path: str | Path, label: str | None = None) -> Columns:
         header = []
     names, units = zip(*map(_unit, header), strict=True) if header else ((), ())
     table, faults, words = _numbers(path, rows[first:], separator, count, place)
-    places = np.array([number for number, _ in rows[first:]])
-    return Columns(path, names, table, units, places, faults, words)
+    return Columns(path, names, table, units, np.array([number for number, _ in rows[first:]]), faults, words)
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

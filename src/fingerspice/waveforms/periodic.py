@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
+from fingerspice.base.units import Degree, Hertz, Ratio, Second, Volt
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.waveform import OSCILLATION, Waveform, as_waveform, check_range, require, terms_of
+from fingerspice.waveforms.waveform import Waveform, as_waveform, check_range, require, terms_of
 
 FEW_KNOTS = 1000  # With so many knots or less a waveform is not divided into windows, however close they are.
 MOST_SHOWN = 10_000  # Most points that the text of a PWL shows.
@@ -251,20 +252,18 @@ class PWL(Ramps):
 class _Periodic(Ramps):
     """A shape of straight pieces repeated for ever, shifted by `delay` and `phase_deg`."""
 
-    amplitude: float
-    frequency: float
-    offset: float = 0.0
-    phase_deg: float = 0.0
-    delay: float = 0.0
+    amplitude: Volt
+    frequency: Hertz
+    offset: Volt = 0.0
+    phase_deg: Degree = 0.0
+    delay: Second = 0.0
     _shift: ClassVar[float]  # Time of the shape's start, s
     # Times of the knots in periods, values over the offset in amplitudes, whether one half is the other turned over
     _shape: ClassVar[tuple[tuple[float, ...], tuple[float, ...], bool]]
-    units: ClassVar[dict[str, str]] = OSCILLATION
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        kind = type(self).__name__.lower()
-        require(self.frequency > 0.0, f"{kind} frequency", f"{self.frequency:g} Hz", "> 0")
+        require(self.frequency > 0.0, f"{type(self).__name__.lower()} frequency", f"{self.frequency:g} Hz", "> 0")
         period = 1.0 / self.frequency
         # Begin whole periods earlier, at or before t = 0: the delay shifts the shape, and holds nothing before it.
         shift = first = self.delay - self.phase_deg / 360.0 / self.frequency
@@ -295,8 +294,8 @@ class Square(_Periodic):
     Amplitude and offset in V, frequency in Hz, duty between 0 and 1, phase in degrees, and delay, a shift, in s.
     """
 
-    duty: float = 0.5
-    units: ClassVar[dict[str, str]] = {"amplitude": "V", "frequency": "Hz", "duty": "", **OSCILLATION}
+    duty: Ratio = 0.5
+    units: ClassVar[dict[str, str]] = {"amplitude": "V", "frequency": "Hz", "duty": "", **_Periodic.units}
 
     # Beside the frequency the duty comes first, as in netlists; the fields that all shapes have precede it otherwise.
     def __init__(
@@ -333,16 +332,13 @@ class Pulse(Ramps):
     Voltages in V, times in s. A rise or fall of 0 is an ideal jump. Without `pulse_period` there is one pulse.
     """
 
-    v1: float
-    v2: float
-    delay: float = 0.0
-    rise: float = 0.0
-    fall: float = 0.0
-    width: float = math.inf
-    pulse_period: float = math.inf
-    units: ClassVar[dict[str, str]] = {
-        "v1": "V", "v2": "V", "delay": "s", "rise": "s", "fall": "s", "width": "s", "pulse_period": "s"
-    }  # fmt: skip
+    v1: Volt
+    v2: Volt
+    delay: Second = 0.0
+    rise: Second = 0.0
+    fall: Second = 0.0
+    width: Second = math.inf
+    pulse_period: Second = math.inf
     _endless = ("width", "pulse_period")
 
     def __post_init__(self) -> None:
@@ -462,9 +458,8 @@ class Burst(_Stretches):
     """
 
     waveform: Waveform
-    duration: float
-    delay: float = 0.0
-    units: ClassVar[dict[str, str]] = {"duration": "s", "delay": "s"}
+    duration: Second
+    delay: Second = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -488,8 +483,7 @@ class Repeat(_Stretches):
     """
 
     waveform: Waveform
-    period: float = field()
-    units: ClassVar[dict[str, str]] = {"period": "s"}
+    period: Second = field()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -497,7 +491,6 @@ class Repeat(_Stretches):
         self._declare(_stretch=self.period)
 
     def tone(self) -> float | None:
-        inside = self.waveform.waveform if isinstance(self.waveform, Burst) else self.waveform
-        tone = inside.tone()
+        tone = (self.waveform.waveform if isinstance(self.waveform, Burst) else self.waveform).tone()
         turns = 0.0 if tone is None else tone * self.period
         return tone if round(turns) >= 1 and abs(turns - round(turns)) < 1e-9 * turns else 1.0 / self.period

@@ -13,6 +13,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, read_only, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
+from fingerspice.base.units import Hertz, Second
 from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, check_count, read_table, wav_layout
 from fingerspice.waveforms.periodic import FEW_KNOTS, PWL, Ramps
 from fingerspice.waveforms.waveform import DC, RANGES, Product, Sum, Waveform, check_range, require
@@ -39,9 +40,8 @@ class Samples(Ramps):
     """
 
     values: FloatArray
-    rate: float
-    start: float = 0.0
-    units: ClassVar[dict[str, str]] = {"rate": "Hz", "start": "s"}
+    rate: Hertz
+    start: Second = 0.0
     # Number of the sample `values[0]` in the whole recording, whose sample number 0 is at `start`.
     _number: ClassVar[int] = 0
     count: ClassVar[int]  #: Number of samples

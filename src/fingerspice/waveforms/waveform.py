@@ -10,6 +10,7 @@ by Chebyshev series instead: see `fingerspice.waveforms.sampling`.
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
 from collections.abc import Callable
@@ -23,11 +24,10 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError, Where
+from fingerspice.base.units import UNITS, Degree, Hertz, PerSecond, Ratio, Second, Volt
 
 RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}  #: Largest and smallest size of a number other than 0; V serves A, too.
 ANY_RANGE = (1e30, 1e-30)  #: The same limits for all other units.
-#: Units of the numbers that every oscillation has.
-OSCILLATION = {"amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s"}
 TAU = 2.0 * math.pi
 # Places in [0, 1], both ends among them, one in each of 512 equal parts: so irregular that no carrier is 0 at all.
 _SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.6180339887498949)[0]) / 512.0, 1.0)
@@ -54,7 +54,7 @@ class Waveform:
     numbers, under the names of the attributes below, when they are made.
     """
 
-    units: ClassVar[dict[str, str]] = {}  #: Unit of each numeric field
+    units: ClassVar[dict[str, str]] = {}  #: Unit of each numeric field, from its type
     period: float | None = None  #: Period in s after any delay, or None
     settled: float = 0.0  #: Time (s) from which the waveform is periodic
     precision: float = DOUBLE  #: Distance of neighbouring numbers of the kind that the values are computed in
@@ -63,6 +63,9 @@ class Waveform:
     _breaks: tuple[float, ...] = ()  # Times (s, ascending) at which the waveform is not smooth
     _quick: float = math.inf  # Shortest time scale (s) between them
     _endless: ClassVar[tuple[str, ...]] = ()  # Names of fields that may be infinite.
+
+    def __init_subclass__(cls) -> None:
+        cls.units = cls.units | {x: UNITS[kind] for x, kind in inspect.get_annotations(cls).items() if kind in UNITS}
 
     def __post_init__(self) -> None:
         """Make doubles of the fields that have a unit, and refuse what is no number of it."""
@@ -248,8 +251,7 @@ def terms_of(m: int, *terms: tuple[FloatArray | float, ...]) -> FloatArray:
 class DC(Waveform):
     """A constant voltage, V."""
 
-    level: float = 0.0
-    units: ClassVar[dict[str, str]] = {"level": "V"}
+    level: Volt = 0.0
     course = math.inf, -math.inf
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
@@ -279,13 +281,12 @@ class Sine(Waveform):
         1/s, SPICE's THETA.
     """
 
-    amplitude: float
-    frequency: float
-    offset: float = 0.0
-    phase_deg: float = 0.0
-    delay: float = 0.0
-    damping: float = 0.0
-    units: ClassVar[dict[str, str]] = {**OSCILLATION, "damping": "1/s"}
+    amplitude: Volt
+    frequency: Hertz
+    offset: Volt = 0.0
+    phase_deg: Degree = 0.0
+    delay: Second = 0.0
+    damping: PerSecond = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -351,15 +352,12 @@ class Chirp(Waveform):
         Degrees, at t = 0.
     """
 
-    amplitude: float
-    f0: float
-    f1: float
-    duration: float
-    offset: float = 0.0
-    phase_deg: float = 0.0
-    units: ClassVar[dict[str, str]] = {
-        "amplitude": "V", "f0": "Hz", "f1": "Hz", "duration": "s", "offset": "V", "phase_deg": "deg"
-    }  # fmt: skip
+    amplitude: Volt
+    f0: Hertz
+    f1: Hertz
+    duration: Second
+    offset: Volt = 0.0
+    phase_deg: Degree = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -392,13 +390,12 @@ class Exp(Waveform):
     Voltages in V, times in s; the time constants are positive and td2 >= td1.
     """
 
-    v1: float
-    v2: float
-    td1: float
-    tau1: float
-    td2: float
-    tau2: float
-    units: ClassVar[dict[str, str]] = {"v1": "V", "v2": "V", "td1": "s", "tau1": "s", "td2": "s", "tau2": "s"}
+    v1: Volt
+    v2: Volt
+    td1: Second
+    tau1: Second
+    td2: Second
+    tau2: Second
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -540,14 +537,11 @@ class AM(_OfFactors):
         Phase of the envelope, degrees.
     """
 
-    amplitude: float
-    carrier: float
-    modulation: float
-    depth: float = 1.0
-    phase_deg: float = 0.0
-    units: ClassVar[dict[str, str]] = {
-        "amplitude": "V", "carrier": "Hz", "modulation": "Hz", "depth": "", "phase_deg": "deg"
-    }  # fmt: skip
+    amplitude: Volt
+    carrier: Hertz
+    modulation: Hertz
+    depth: Ratio = 1.0
+    phase_deg: Degree = 0.0
 
     def __post_init__(self) -> None:
         Waveform.__post_init__(self)
