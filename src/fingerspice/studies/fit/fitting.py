@@ -50,6 +50,7 @@ def measured_of(
     refuse(missing, f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
     columns = {name: real_numbers(f"data column {name!r}", x, "numbers") for name, x in given.items() if name != by}
     size = max((x.size for x in columns.values()), default=0)
+    refuse(bool(columns) and size == 0, "the data have no rows; allowed: one or more measurements")
     for name, x in columns.items():
         said = f"data column {name!r} has the shape {x.shape}, others have {size} rows"
         refuse(x.shape not in ((), (size,)), f"{said}; allowed: as many, or one number for all")
