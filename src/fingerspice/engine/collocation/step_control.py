@@ -185,20 +185,6 @@ def rung(h: float) -> float:
     return out
 
 
-@jit
-def change_level(live: FloatArray, project: FloatArray, old: int, new: int, error: FloatArray) -> None:
-    """Carry the modes' error from one reference area to another."""
-    n = live.shape[1]
-    x = np.zeros(n)
-    for i in range(n):
-        for k in range(n):
-            x[i] += live[old, i, k] * error[k]
-    for k in range(n):
-        error[k] = 0.0
-        for i in range(n):
-            error[k] += project[new, k, i] * x[i]
-
-
 @jit_rows
 def slope_at(u: FloatArray, j: int) -> float:
     """Slope at node j of the polynomial through values at the nodes, per step."""

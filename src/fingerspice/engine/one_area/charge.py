@@ -38,10 +38,10 @@ def charge_step(
     Both are computed through the layer that leaks slowest: the sum over all leaks would be a small difference of large
     currents. The charge that this layer stores follows from its voltages, not from the integral of w': for a fast mode
     that has decayed w' still contains its rate times the error of w, and quadrature over a step much longer than the
-    mode's time constant would turn this into charge. `work.places` holds the error of the modes (see
-    `exponential.assess`), of which the part up to fraction `theta` of the step counts.
+    mode's time constant would turn this into charge. `places` holds the error of the modes, of which the part up to
+    fraction `theta` of the step counts.
     """
-    model, r, w, pull = system.model, work.r, work.w, work.pull
+    model, r, w, pull, places = system.model, work.r, work.modal.w, work.modal.pull, work.modal.places
     rates, gain, gap, slow_share = system.rates[level], system.gain[level], system.gap[level], system.slow[level]
     n = rates.size
     slow = model.slow
@@ -80,7 +80,7 @@ def charge_step(
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control.peak_q = max(control.peak_q, abs(z[j]))
     kept = missed if theta < 1.0 else kept
-    _account(model, gap, slow_share, w, r, h, work.places, theta, missed, kept, control, collected)
+    _account(model, gap, slow_share, w, r, h, places, theta, missed, kept, control, collected)
 
 
 @jit
