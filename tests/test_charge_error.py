@@ -20,7 +20,7 @@ from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.readout import N_PLACES
 from fingerspice.engine.many_areas import error as many_charge
 from fingerspice.engine.many_areas import form as blocks
-from fingerspice.engine.many_areas.coupling import STIFF, cell_currents, take_coupling
+from fingerspice.engine.many_areas.coupling import STIFF, take_coupling
 from fingerspice.engine.many_areas.form import Form
 from fingerspice.engine.one_area import charge, rows
 from fingerspice.engine.one_area.model import Model
@@ -446,8 +446,7 @@ def test_currents_and_the_distance_to_the_fold_under_mobile(seed: int, sizes: tu
     least = np.zeros(ROWS)
     blocks.answer_mobile(form, work, n_area > 1, work.cells, work.areas, least)
     want, distance = solved(given)
-    j = work.cells[blocks.J]
-    cell_currents(x.root, work.cells[blocks.RHO], j)
+    j = x.root @ work.cells[blocks.RHO]
     np.testing.assert_allclose(j, want, rtol=0.0, atol=1e-10 * np.abs(want).max())
     np.testing.assert_allclose(least, distance, rtol=1e-10)
 

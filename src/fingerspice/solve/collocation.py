@@ -17,7 +17,7 @@ from fingerspice.base.arrays import FloatArray, IntArray, views_of
 from fingerspice.circuit.network import Modes, Network
 from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
-from fingerspice.engine.collocation.exponential import forget, new_tables
+from fingerspice.engine.collocation.exponential import new_tables
 from fingerspice.engine.collocation.loop import Looks, no_looks
 from fingerspice.engine.collocation.step_control import end_row
 from fingerspice.engine.many_areas.form import REFERRED, Form, held, new_network_work
@@ -74,7 +74,7 @@ class _Scratch(threading.local):
         tables, work, before = self.by_size.get(n) or (new_tables(n), new_stack_work(n), None)
         if before is not system:
             self.by_size[n] = tables, work, system
-            forget(tables)
+            tables.used[:] = 0
         return tables, work
 
 

@@ -48,28 +48,26 @@ def converge(circuit: Any, state: Any, tol: float) -> tuple[int, bool, float]:
     difference is measured, with the weight of each mode, by how far it moves the gap voltages.
     """
     x, phi = circuit.work.modal, circuit.tables.phi[state.step[0].slot]
-    pull, used = x.pull, x.used
+    w, base, pull, used = x.w, x.base, x.pull, x.used
+    weight, pull_before, left_before, u, guess = x.weight, x.pull_before, x.left_before, x.u, x.guess
     for k in range(used.shape[0]):
         for i in range(ROWS):
-            x.w[k, i] = x.base[k, i]
+            w[k, i] = base[k, i]
             used[k, i] = 0.0
     slow = False
     step, answer = 0.0, 0.0
     # The loop includes the first evaluation: `evaluate` is inlined at each call, so that one call compiles once.
     for iteration in range(1, 41):
         if iteration > 1:
-            if slow:
-                step = mix(pull, used, x.weight, x.pull_before, x.left_before)
-            else:
-                step = plain(pull, used, x.weight, x.pull_before, x.left_before)
-            respond(used, phi, x.base, x.w)
+            step = move_on(pull, used, weight, pull_before, left_before, slow)
+            respond(used, phi, base, w)
         if not _evaluate(circuit, state):
             return iteration, False, answer
-        change = moved(x.u, x.guess)
+        change = moved(u, guess)
         if iteration == 1:
             continue
         # The next change of the gap voltages: their last one, times the ratio of the nonlinear term's changes.
-        left = distance(pull, used, x.weight)
+        left = distance(pull, used, weight)
         if iteration == 2 and step > 0.0:
             answer = left / step
         if not left < math.inf:
@@ -92,39 +90,35 @@ def moved(u: FloatArray, before: FloatArray) -> float:
     return math.sqrt(total)
 
 
-@jit
-def weigh(rates: FloatArray, gap: FloatArray, decay: FloatArray, h: float, weight: FloatArray) -> None:
-    """Move of the gap voltage over a step by a unit forcing of each mode, into `weight` (n,)."""
-    for k in range(rates.size):
-        weight[k] = gap[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
-
-
 @jit_rows
-def plain(
-    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
-) -> float:
-    """Picard step of the iteration, remembered for a later Anderson step (`mix`); returns the size of the move."""
+def move_on(
+    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray,
+    mixed: bool,
+) -> float:  # fmt: skip
+    """Next nonlinear term of the iteration, into `used`, and what a later one needs; returns the size of the move.
+
+    It is the last term (Picard) or, if `mixed`, made of the last two (Anderson 1965, one step back). In a stiff stack a
+    Picard step reduces the residual by a factor, the area's share of the leakage. Mixing squares it.
+    """
+    share = _share(pull, used, weight, left_before) if mixed else 0.0
     total = 0.0
     for k in range(pull.shape[0]):
         size = 0.0
         for i in range(ROWS):
-            left = pull[k, i] - used[k, i]
-            size += left * left
-            left_before[k, i] = left
+            left_before[k, i] = pull[k, i] - used[k, i]
+            # What was before may be no number at the first step.
+            new = pull[k, i] - share * (pull[k, i] - pull_before[k, i]) if share != 0.0 else pull[k, i]
             pull_before[k, i] = pull[k, i]
-            used[k, i] = pull[k, i]
+            move = new - used[k, i]
+            size += move * move
+            used[k, i] = new
         total += weight[k] * weight[k] * size
     return math.sqrt(total)
 
 
 @jit_rows
-def mix(
-    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
-) -> float:
-    """Next nonlinear term from the last two (Anderson 1965, one step back), into `used`; returns the size of the move.
-
-    In a stiff stack a Picard step reduces the residual by a factor, the area's share of the leakage. Mixing squares it.
-    """
+def _share(pull: FloatArray, used: FloatArray, weight: FloatArray, left_before: FloatArray) -> float:
+    """Share of the last term but one that leaves least of the residual."""
     across = 0.0
     along = 0.0
     for k in range(pull.shape[0]):
@@ -138,24 +132,12 @@ def mix(
         across += weight[k] * weight[k] * mine
         along += weight[k] * weight[k] * size
     share = across / along if along > 0.0 else 0.0
-    share = min(max(share, -1.0), 0.9)
-    total = 0.0
-    for k in range(pull.shape[0]):
-        size = 0.0
-        for i in range(ROWS):
-            left_before[k, i] = pull[k, i] - used[k, i]
-            new = pull[k, i] - share * (pull[k, i] - pull_before[k, i])
-            pull_before[k, i] = pull[k, i]
-            move = new - used[k, i]
-            size += move * move
-            used[k, i] = new
-        total += weight[k] * weight[k] * size
-    return math.sqrt(total)
+    return min(max(share, -1.0), 0.9)
 
 
 @jit_rows
 def distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
-    """Norm of the difference of two nonlinear terms, with the weight of each mode from `weigh`."""
+    """Norm of the difference of two nonlinear terms, with the weight of each mode."""
     total = 0.0
     for k in range(a.shape[0]):
         size = 0.0
@@ -194,17 +176,14 @@ def new_tables(n: int) -> Tables:
     )
 
 
-def forget(tables: Tables) -> None:
-    """Empty the tables."""
-    tables.used[:] = 0
-
-
 @jit_within
 def take_tables(circuit: Any, state: Any, level: int, h: float, rates: FloatArray, gap: FloatArray) -> None:
-    """Take the tables of a step of length h (s) around a reference, and what its modes do to the gap (see `weigh`)."""
-    step, tables = state.step[0], circuit.tables
+    """Take the tables of a step of length h (s) around a reference; a unit of each mode moves the gap by `gap` (V)."""
+    step, tables, weight = state.step[0], circuit.tables, circuit.work.modal.weight
     step.slot, step.tabled = _make_tables(tables, rates, level, h), h
-    weigh(rates, gap, tables.decay[step.slot], h, circuit.work.modal.weight)
+    decay = tables.decay[step.slot]
+    for k in range(rates.size):
+        weight[k] = gap[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
 
 
 @jit
@@ -299,32 +278,29 @@ def carry(circuit: Any, state: Any, gap: FloatArray, answer: float) -> None:
     """
     x, error, slot = circuit.work.modal, state.error, state.step[0].slot
     base, used, off, shifted, other = x.spare[0], x.spare[1], x.spare[2], x.spare[3], x.spare[4]
-    decay, phi, carried = circuit.tables.decay[slot], circuit.tables.phi[slot], x.carried
+    decay, phi, carried, w = circuit.tables.decay[slot], circuit.tables.phi[slot], x.carried, x.w
     largest_u, reach = largest_size(x.u.ravel()), 0.0
-    for k in range(x.w.shape[0]):
+    for k in range(w.shape[0]):
         for a in range(gap.shape[0]):
             # A slow area is a mode behind the others, in units of its area at 0 V.
             reach = max(reach, abs((gap[a, k] if k < gap.shape[1] else largest_u) * error[k]))
     shift = _SHIFT * largest_u
     answers = answer > _SLIGHT and 0.0 < shift / reach < math.inf
     scale = shift / reach if answers else 1.0
-    for k in range(x.w.shape[0]):
+    for k in range(w.shape[0]):
         for i in range(ROWS):
             off[k, i] = base[k, i] = scale * decay[k, i] * error[k]
             used[k, i] = 0.0
     for iteration in range(_PASSES if answers else 0):
-        _add(x.w, 1.0, off, shifted)
+        _add(w, 1.0, off, shifted)
         if not _probe(circuit, state, shifted, other):
             break
         _add(other, -1.0, x.pull, shifted)
-        if iteration > 0:
-            move = mix(shifted, used, x.weight, x.pull_before, x.left_before)
-        else:
-            move = plain(shifted, used, x.weight, x.pull_before, x.left_before)
+        move = move_on(shifted, used, x.weight, x.pull_before, x.left_before, iteration > 0)
         respond(used, phi, base, off)
         if not move > _ENOUGH * shift:
             break
-    for k in range(x.w.shape[0]):
+    for k in range(w.shape[0]):
         for p in range(3):
             carried[k, p] = off[k, NODES + p] / scale
         carried[k, 3] = off[k, END] / scale
@@ -345,13 +321,14 @@ def mode_error(
     iteration; and the `error` at the start as carried on. The first has the response at `rows`, which goes into `off`
     (4, m); it and the second are `magnified`. Returned is the interpolation error of the mode itself.
     """
-    pull, left, places = between(x.pull[k]), x.spare[5, k], x.places[k]
+    pull, left, miss = between(x.pull[k]), x.spare[5, k], tables.miss[slot, k]
+    places, carried = x.places[k], x.carried[k]
     missed = largest((lin[0] + pull[0]) / MISS[0], (lin[1] + pull[1]) / MISS[1], (lin[2] + pull[2]) / MISS[2])
     left_over(tables.phi[slot, k], x.pull[k], x.used[k], left)
     places[0] = error
     for p in range(4):
-        off[p, k] = magnified * tables.miss[slot, k, rows[p]] * missed
-        places[p + 1] = x.carried[k, p] + magnified * left[p] + off[p, k]
+        off[p, k] = magnified * miss[rows[p]] * missed
+        places[p + 1] = carried[p] + magnified * left[p] + off[p, k]
     return between(x.w[k])
 
 

@@ -106,11 +106,11 @@ class Modal(NamedTuple):
     base: FloatArray
     pull: FloatArray
     used: FloatArray
-    # pull_before, left_before (m, ROWS): Nonlinear term and what was left of it an iteration before (see `mix`)
+    # pull_before, left_before (m, ROWS): Nonlinear term and what was left of it an iteration before
     pull_before: FloatArray
     left_before: FloatArray
     spare: FloatArray  # (6, m, ROWS): Scratch
-    # w0, weight (m,): The modes at the start of the step; effect of each on the gap voltage (see `weigh`)
+    # w0, weight (m,): The modes at the start of the step; move of the gap voltage over it by a unit forcing of each
     w0: FloatArray
     weight: FloatArray
     # places, carried (m, N_PLACES) and (m, N_PLACES - 1): Errors of the modes, and those carried over from earlier
@@ -186,13 +186,13 @@ def end_at(theta: float, x: Modal, error: FloatArray) -> None:
 
     The error is interpolated between the places where it is known.
     """
-    p = 0
+    w, w0, places, basis, p = x.w, x.w0, x.places, x.basis, 0
     while p < N_PLACES - 2 and theta > _AT[p + 1]:
         p += 1
     share = (theta - _AT[p]) / (_AT[p + 1] - _AT[p])
-    for k in range(x.w0.size):
-        x.w0[k] = at(x.w[k], x.basis)
-        error[k] = (1.0 - share) * x.places[k, p] + share * x.places[k, p + 1]
+    for k in range(w0.size):
+        w0[k] = at(w[k], basis)
+        error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
 
 
 @jit_rows

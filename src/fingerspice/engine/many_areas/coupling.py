@@ -328,16 +328,3 @@ def answer_together(
                         rho[b, i] += x * rho[c, i]
             for i in range(ROWS):
                 rho[b, i] *= share[b, i]
-
-
-@jit_rows
-def cell_currents(root: FloatArray, rho: FloatArray, j: FloatArray) -> None:
-    """The cells' currents beside those at the reference areas (A), from rho."""
-    for b in range(root.shape[0]):
-        for i in range(ROWS):
-            j[b, i] = 0.0
-        for c in range(root.shape[0]):
-            share = root[b, c]
-            if share != 0.0:
-                for i in range(ROWS):
-                    j[b, i] += share * rho[c, i]

@@ -6,16 +6,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.collocation.exponential import Tables, between, largest, mode_error
+from fingerspice.engine.collocation.exponential import between, largest, mode_error
 from fingerspice.engine.collocation.readout import N_PLACES, Control, row_of
-from fingerspice.engine.collocation.step_control import first_wrong, leaves
+from fingerspice.engine.collocation.step_control import first_wrong
 from fingerspice.engine.many_areas import form as forms
-from fingerspice.engine.many_areas.coupling import cell_currents
 from fingerspice.engine.many_areas.form import Form, Work
 from fingerspice.engine.one_area.charge import LOBE, integrate
 from fingerspice.numerics.lobatto import DERIVATIVE, END, NODES, POINTS, ROWS
@@ -80,9 +80,7 @@ def _largest_voltage(shape: FloatArray, follow: FloatArray, m: int, off: FloatAr
 
 
 @jit_within
-def assess(
-    form: Form, work: Work, tables: Tables, slot: int, h: float, error: FloatArray, magnified: float
-) -> float:  # fmt: skip
+def assess(c: Any, s: Any) -> float:
     """Error of a converged step, V, from the interpolation errors between its nodes; see `exponential.mode_error`.
 
     `places` receives the errors of the modes, `run` those of the gaps' voltages; both contain the residual of
@@ -90,13 +88,14 @@ def assess(
     sources behind them, at the points between the nodes and at the end; its last row is that of a decay which is over
     before the first node.
     """
-    x, lin, s, off, size = work.modal, work.lin, work.s, work.off, work.size
+    form, work, error, step, x = forms.form_of(c, s), c.work, s.error, s.step[0], c.work.modal
+    lin, off, size, h, magnified = work.lin, work.off, work.size, step.length, step.grown
     w, pull, places, run, gap, rates = x.w, x.pull, x.places, x.run, form.gap, form.rates
     n, m = gap.shape[1], w.shape[0]
-    for j in range(s.shape[0]):
-        off[0, m + j], off[1, m + j], off[2, m + j] = between(s[j])
+    for j in range(work.s.shape[0]):
+        off[0, m + j], off[1, m + j], off[2, m + j] = between(work.s[j])
     for k in range(m):
-        mode = mode_error(x, k, between(lin[k]), tables, slot, _WORST, magnified, error[k], off)
+        mode = mode_error(x, k, between(lin[k]), c.tables, step.slot, _WORST, magnified, error[k], off)
         # The slope of the mode at the start shows such a decay: it differs by the decay's size times its rate.
         fall = 0.0
         for j in range(NODES):
@@ -106,18 +105,18 @@ def assess(
         for p in range(3):
             off[p, k] += mode[p]
             places[k, p + 1] += mode[p]
-    step = _largest_voltage(form.shape, form.follow, m, off)
+    largest_one: float = _largest_voltage(form.shape, form.follow, m, off)
     for k in range(n, m):
         for p in range(4):
-            if not size[k] * abs(off[p, k]) <= step:
-                step = size[k] * abs(off[p, k])
+            if not size[k] * abs(off[p, k]) <= largest_one:
+                largest_one = size[k] * abs(off[p, k])
     for a in range(run.shape[0]):
         for p in range(N_PLACES):
             total = 0.0
             for k in range(n):
                 total += gap[a, k] * (places[k, p] + (off[4, k] if p == 0 else 0.0))
             run[a, p] = abs(total)
-    return step
+    return largest_one
 
 
 @jit
@@ -142,24 +141,6 @@ def turn_at_start(cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t
             branch[a, 0], branch[a, 1] = t, math.inf
             turned = True
     return turned
-
-
-@jit
-def first_zero(
-    cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, h: float, theta: float, t_new: float,
-    later: bool, series: FloatArray,
-) -> tuple[int, float, float]:  # fmt: skip
-    """The area whose gap voltage is the first to leave its branch before t_new, or -1; the fraction and the time.
-
-    With `later` zeros at the start of the step are passed over.
-    """
-    which = -1
-    for a in range(cell.size):
-        if cell[a] >= 0:
-            crossing = leaves(u[a], sign[a], tol, series)
-            if crossing <= theta and t + crossing * h <= t_new and not (later and t + crossing * h <= t):
-                which, theta, t_new = a, crossing, t + crossing * h
-    return which, theta, t_new
 
 
 @jit_rows
@@ -275,17 +256,17 @@ def charge_error(
             lasting[k, p] = places[k, p] - (brief[k, p] if p > 0 else 0.0)
     _cell_errors(form, lasting, areas[forms.SLOPE], cell_slips[0])
     _cell_errors(form, brief, areas[forms.SLOPE], cell_slips[1])
-    off_briefly = np.empty(N_PLACES)
+    off_briefly, mobile = np.empty(N_PLACES), form.mobile
     for source in range(form.stored.shape[0]):
         first, second, third = between(z[source])
         swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
-        if not form.mobile:
+        if not mobile:
             swing, end = _area_missed(form, source, u, areas[forms.AREA])
         for p in range(1, N_PLACES - 1):
-            leak = _leak(form, source, p, brief, cell_slips[1], u, more)
+            leak = _part(form, source, p, form.lost, form.g, True, brief, cell_slips[1], u, more)
             lobe = max(lobe, _HALF_LOBE * h * abs(leak))
         for p in range(N_PLACES):
-            held = _held(form, source, p, brief, cell_slips[1], u, more)
+            held = _part(form, source, p, form.stored, form.c, mobile, brief, cell_slips[1], u, more)
             own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
             off_briefly[p] = max(abs(held), abs(own), swing, lobe)
             apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
@@ -296,15 +277,15 @@ def charge_error(
         added, last_leak, last_theta = 0.0, 0.0, 0.0
         for p in range(N_PLACES):
             row = row_of(p)
-            leak = _leak(form, source, p, lasting, cell_slips[0], u, more)
+            leak = _part(form, source, p, form.lost, form.g, True, lasting, cell_slips[0], u, more)
             if p > 0:
                 reached = min(POINTS[row], theta)
                 part = (reached - last_theta) / (POINTS[row] - last_theta)
-                turned = 0.0 if form.mobile else _turned(form, source, p, cell_slips[0], u, areas[forms.AREA])
+                turned = 0.0 if mobile else _turned(form, source, p, cell_slips[0], u, areas[forms.AREA])
                 added += part * (0.5 * h * (POINTS[row] - last_theta) * (leak + last_leak) + turned)
                 last_theta = POINTS[row]
             last_leak = leak
-            now = _held(form, source, p, lasting, cell_slips[0], u, more)
+            now = _part(form, source, p, form.stored, form.c, mobile, lasting, cell_slips[0], u, more)
             known = now + collected[0, source] + added
             error = math.sqrt(known * known + off_briefly[p] * off_briefly[p] + collected[1, source])
             control.error_q = max(control.error_q, error)
@@ -329,36 +310,21 @@ def _cell_errors(form: Form, places: FloatArray, slope: FloatArray, off: FloatAr
 
 
 @jit
-def _held(
-    form: Form, source: int, p: int, places: FloatArray, off: FloatArray, u: FloatArray, more: FloatArray
+def _part(
+    form: Form, source: int, p: int, by_mode: FloatArray, by_cell: FloatArray, moves: bool, places: FloatArray,
+    off: FloatArray, u: FloatArray, more: FloatArray,
 ) -> float:  # fmt: skip
-    """Stored part of a charge's error at a place, C."""
+    """Stored part of a charge's error at a place (C), or the rate (A) at which it leaks; `moves`: by the areas, too."""
     total = 0.0
     row = row_of(p)
-    for k in range(form.stored.shape[1]):
-        total += form.stored[source, k] * places[k, p]
-    for b in range(form.c.size):
+    for k in range(by_mode.shape[1]):
+        total += by_mode[source, k] * places[k, p]
+    for b in range(by_cell.size):
         a = form.home[b]
-        moved = more[a, row] * off[p, b]
-        if form.mobile:
-            moved += u[b, row] * off[p, form.c.size + a]
-        total += form.through[source, b] * form.c[b] * moved
-    return total
-
-
-@jit
-def _leak(
-    form: Form, source: int, p: int, places: FloatArray, off: FloatArray, u: FloatArray, more: FloatArray
-) -> float:  # fmt: skip
-    """Rate at which the error at a place adds to the lasting error of a charge by leaking, A."""
-    lost, g, total = form.lost, form.g, 0.0
-    row = row_of(p)
-    for k in range(lost.shape[1]):
-        total += lost[source, k] * places[k, p]
-    for b in range(g.size):
-        a = form.home[b]
-        both = more[a, row] * off[p, b] + u[b, row] * off[p, g.size + a]
-        total += form.through[source, b] * g[b] * both
+        both = more[a, row] * off[p, b]
+        if moves:
+            both += u[b, row] * off[p, by_cell.size + a]
+        total += form.through[source, b] * by_cell[b] * both
     return total
 
 
@@ -387,19 +353,13 @@ def _area_missed(form: Form, source: int, u: FloatArray, area: FloatArray) -> tu
         a = form.home[b]
         first, second, third = between(area[a])
         worst = max(abs(first), abs(second), abs(third))
-        lobes = LOBE * abs(form.through[source, b]) * form.c[b] * worst * _way(u[b])
+        total = 0.0
+        for i in range(1, NODES):
+            total += abs(u[b, i] - u[b, i - 1])
+        lobes = LOBE * abs(form.through[source, b]) * form.c[b] * worst * total
         way += lobes
         end += lobes * min(1.0, worst / area[a, 0])
     return way, end
-
-
-@jit
-def _way(values: FloatArray) -> float:
-    """Total variation of values at the nodes."""
-    total = 0.0
-    for i in range(1, NODES):
-        total += abs(values[i] - values[i - 1])
-    return total
 
 
 @jit_within
@@ -409,10 +369,9 @@ def step_charges(
     """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
     cells, w, cell_u = work.cells, work.modal.w, work.cells[forms.CELL_U]
     forms.mode_rates(h, form.rates, w, work.lin, work.modal.pull, False, work.d)
-    forms.clear(cell_u)
-    forms.combine(form.tap, w[: form.shape.shape[0]], cell_u)
+    forms.multiply(form.tap, w[: form.shape.shape[0]], None, cell_u)
     forms.combine(form.tap_s, work.s, cell_u)
-    cell_currents(work.own.root, cells[forms.RHO], cells[forms.J])
+    forms.multiply(work.own.root, cells[forms.RHO], None, cells[forms.J])
     if not form.mobile:
         for a in range(form.cell.size):
             if form.cell[a] >= 0 and form.slow[a] < 0:

@@ -180,11 +180,11 @@ def combine(matrix: FloatArray, rows: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
-def combine_from(matrix: FloatArray, rows: FloatArray, start: FloatArray, out: FloatArray) -> None:
-    """out = start + matrix @ rows, at all rows of a step."""
+def multiply(matrix: FloatArray, rows: FloatArray, start: FloatArray | None, out: FloatArray) -> None:
+    """out = matrix @ rows, more than `start` if that is given, at all rows of a step."""
     for c in range(matrix.shape[0]):
         for i in range(ROWS):
-            out[c, i] = start[c, i]
+            out[c, i] = 0.0 if start is None else start[c, i]
         for k in range(matrix.shape[1]):
             share = matrix[c, k]
             for i in range(ROWS):
@@ -292,7 +292,7 @@ def _evaluate(
     stiff = coupling.key[1] > 0
     eta, rho = cells[ETA], cells[RHO]
     area, slope, rate, more = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE]
-    combine_from(form.gap, w, areas[U_S], areas[U])
+    multiply(form.gap, w, areas[U_S], areas[U])
     clear(pull)
     if stiff:
         mode_rates(h, rates, w, lin, pull, True, d)
@@ -306,11 +306,11 @@ def _evaluate(
                     rate[a],
                 )  # fmt: skip
             _subtract(area[a], form.area0[a], more[a])
-    combine_from(coupling.from_modes, w, cells[ETA_S], eta)
+    multiply(coupling.from_modes, w, cells[ETA_S], eta)
     if stiff:
         combine(coupling.from_stiff, d[:n], eta)
     if mobile:
-        combine_from(coupling.held, w, cells[CHI_S], cells[CHI])
+        multiply(coupling.held, w, cells[CHI_S], cells[CHI])
         answer_mobile(form, work, several, cells, areas, least)
         for i in range(ROWS):
             # NaN is no solution either.
@@ -362,16 +362,12 @@ def follow_sources(form: Form, work: Work) -> None:
     """The parts of a step's rows that depend on the sources alone; see `_evaluate`."""
     coupling, s, ds, lin, cells, areas = work.own, work.s, work.ds, work.lin, work.cells, work.areas
     n = form.gap.shape[1]
-    clear(lin)
-    combine(form.gain, s, lin)
-    clear(cells[ETA_S])
-    combine(coupling.from_rates, lin[:n], cells[ETA_S])
+    multiply(form.gain, s, None, lin)
+    multiply(coupling.from_rates, lin[:n], None, cells[ETA_S])
     combine(coupling.from_slopes, ds, cells[ETA_S])
     combine(coupling.from_sources, s, cells[ETA_S])
-    clear(cells[CHI_S])
-    combine(coupling.from_slopes, s, cells[CHI_S])
-    clear(areas[U_S])
-    combine(form.gap_s, s, areas[U_S])
+    multiply(coupling.from_slopes, s, None, cells[CHI_S])
+    multiply(form.gap_s, s, None, areas[U_S])
 
 
 @jit_within

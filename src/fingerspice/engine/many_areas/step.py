@@ -11,8 +11,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.collocation import exponential, readout, step_control
@@ -71,15 +69,6 @@ def find(references: References, form: Form, area: FloatArray) -> int:
 
 
 @jit
-def go_over(references: References, one: int, form: Form, error: FloatArray) -> None:
-    """Turn a form into that of another reference, and transform the error of the modes."""
-    x = np.zeros(form.shape.shape[0])
-    apply(form.shape, error, x)
-    copy_to(form.numbers, references.numbers[one])
-    apply(form.inverse, x, error)
-
-
-@jit
 def start_at(area0: FloatArray, area: FloatArray) -> None:
     """Areas (n_area, ROWS) as at their references."""
     for a in range(area0.size):
@@ -91,8 +80,6 @@ def start_at(area0: FloatArray, area: FloatArray) -> None:
 _ROUNDING, _UNNOTICED = 1e-14, 1e-9
 # Number of modes times steps between two pauses, in which Python can react to Ctrl-C.
 _AT_ONCE = 40_000
-# A step that is to reach a zero of a gap voltage is this much longer, relative to the branch.
-_BEYOND = 1.02
 
 
 class ManyAreas(NamedTuple):
@@ -141,24 +128,13 @@ def start(c: ManyAreas, s: LoopState) -> None:
     step.several = 0
     for b in range(1, form.home.size):
         step.several |= int(form.home[b] != form.home[0])
-    step.smooth = int(
-        _all_zero(form.tap_s) and _all_zero(form.stored_s) and _all_zero(form.follow) and _all_zero(form.gap_s)
-    )
+    step.smooth = int(not (form.tap_s.any() or form.stored_s.any() or form.follow.any() or form.gap_s.any()))
     for i in range(work.segment.size):
         work.segment[i] = 0
     work.areas[:] = 0.0
     start_at(form.area0, work.areas[forms.AREA])
     for k in range(work.size.size):
         work.size[k] = form.size[k] if k < n else c.u_scale
-
-
-@jit
-def _all_zero(x: FloatArray) -> bool:
-    for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
-            if x[i, j] != 0.0:
-                return False
-    return True
 
 
 @jit_within
@@ -279,7 +255,7 @@ def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
             work.here[a] = (
                 form.unit[a] * s.y[slow] if slow >= 0 else 1.0 / inverse_area(abs(voltage), form.curves[a])[0]
             )
-        end = branch[a, 0] + _BEYOND * branch[a, 1] - t
+        end = branch[a, 0] + step_control.BEYOND * branch[a, 1] - t
         if 0.0 < end < ahead:
             ahead = end
             control.branch_start, control.branch_length = branch[a, 0], branch[a, 1]
@@ -287,12 +263,14 @@ def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
 
 @jit_within
 def _take_reference(c: ManyAreas, s: LoopState) -> bool:
-    """Go over to the reference nearest to the present areas; False if it has not been made yet."""
-    form, work = c.form, c.work
+    """Go over to the reference nearest to the present areas, with the error; False if it has not been made yet."""
+    form, work, x = c.form, c.work, c.work.modal.w0
     found = find(c.references, form, work.here)
     if found < 0:
         return False
-    go_over(c.references, found, form, s.error)
+    apply(form.shape, s.error, x)
+    copy_to(form.numbers, c.references.numbers[found])
+    apply(form.inverse, x, s.error)
     work.at[0], s.step[0].tabled = found, 0.0
     copy_to(work.size[: form.shape.shape[0]], form.size)
     start_at(form.area0, work.areas[forms.AREA])
@@ -346,7 +324,7 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     if form.mobile:
         step.grown = 1.0 / work.room[3].min()
     exponential.carry(c, s, form.gap, answer)
-    error = errors.assess(form, work, c.tables, step.slot, h, s.error, step.grown)
+    error = errors.assess(c, s)
     step.step_error = max(error, errors.charged(form.cell, u, work.areas[forms.AREA])) if pace.charge else error
     return readout.GO_ON
 
@@ -388,10 +366,8 @@ def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     step.t_new, step.theta, step.crossed = t + h, 1.0, -1
     if step.t_new >= stop or stop - step.t_new <= 1e-12 * h:
         step.t_new, step.theta = stop, min(1.0, (stop - t) / h)
-    u, turned_enough = work.areas[forms.U], step.flips > c.sign.size
-    step.crossed, step.theta, step.t_new = errors.first_zero(
-        c.form.cell, u, c.sign, pace.tol, t, h, step.theta, step.t_new, turned_enough, work.room[0]
-    )  # fmt: skip
+    u, turned_enough = work.modal.u, step.flips > c.sign.size
+    _cut_at_zero(c, pace, s, turned_enough)
     a = step.crossed
     if a >= 0 and step.t_new <= t:
         branch = branch_of(c, s)
@@ -424,6 +400,18 @@ def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
 
 
 @jit_within
+def _cut_at_zero(c: ManyAreas, pace: Pace, s: LoopState, later: bool) -> None:
+    """End a step where a gap voltage first leaves its branch; if `later`, zeros at the step's start are passed over."""
+    step, u, t, series = s.step[0], c.work.modal.u, s.control[0].t, c.work.room[0]
+    for a in range(c.sign.size):
+        if c.form.cell[a] >= 0:
+            crossing = step_control.leaves(u[a], c.sign[a], pace.tol, series)
+            reached = t + crossing * step.length
+            if crossing <= step.theta and reached <= step.t_new and not (later and reached <= t):
+                step.crossed, step.theta, step.t_new = a, crossing, reached
+
+
+@jit_within
 def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
     """Inverse distance of a step to the fold with all modes, also those that the step takes for stiff.
 
@@ -431,9 +419,8 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
     """
     form, work, spare = c.form, c.work, c.work.spare_cells
     _take_coupling(c, s, 0.0)
-    forms.clear(spare[forms.CHI])
     forms.clear(spare[forms.ETA])
-    forms.combine(work.own.held, work.modal.w[: form.shape.shape[0]], spare[forms.CHI])
+    forms.multiply(work.own.held, work.modal.w[: form.shape.shape[0]], None, spare[forms.CHI])
     forms.combine(work.own.from_slopes, work.s, spare[forms.CHI])
     forms.answer_mobile(form, work, s.step[0].several > 0, spare, work.areas, work.room[3])
     least: float = work.room[3, :NODES].min()

@@ -98,17 +98,12 @@ def begin(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
 @jit_within
 def _enter_segment(c: OneArea, pace: Pace, s: LoopState) -> bool:
     """Take the jump of the source at the start of a segment; False if it meets a fold."""
-    step, control, model = s.step[0], s.control[0], c.system.model
+    step, control = s.step[0], s.control[0]
     # Time is counted from the edge: a transient after it may be faster than the rounding of t.
     step.since = control.t - step.start
     step.begun, step.evaluated = control.t, s.counters[readout.NFEV]
-    u_source = source_voltage(c, s, step.since)
-    if model.mobile or pace.charge:
-        if not step_control.enter(model, pace.charge, u_source, s.y, control):
-            return False
-    else:
-        control.u_gap = model.k_gap * u_source + dot(model.gap, s.y)
-        step_control.take_branch(1.0 if control.u_gap >= 0.0 or not model.coupled else -1.0, control)
+    if not step_control.enter(c.system.model, pace.charge, source_voltage(c, s, step.since), s.y, control):
+        return False
     # Try the step that was right after the edge before: similar jumps often need similar steps.
     control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
     step.fresh = step_control.AFTER_EDGE
@@ -209,7 +204,7 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
     """
     system, work, step, x, level = c.system, c.work, s.step[0], c.work.modal, s.step[0].level
     r, off, sums, run, gain, gap = work.r, work.off, work.sums, x.run[0], system.gain[level], system.gap[level]
-    mobile, area0, n = system.model.mobile, system.model.area0, x.w0.size
+    mobile, area0, places, n = system.model.mobile, system.model.area0, x.places, x.w0.size
     off[0, n], off[1, n], off[2, n] = between(r[SOURCE])
     # Outputs are read from the polynomial through the gap voltages at the nodes: its interpolation error counts.
     sums[0, 0], sums[0, 1], sums[0, 2] = between(r[U])
@@ -221,9 +216,9 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
         mode = exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
         for p in range(4):
             sums[1, p] += gap[k] * off[p, k]
-            sums[2, p] += gap[k] * x.places[k, p + 1]
+            sums[2, p] += gap[k] * places[k, p + 1]
         for p in range(3):
-            x.places[k, p + 1] += mode[p]
+            places[k, p + 1] += mode[p]
     worst, magnified = 0.0, 1.0
     run[0] = 0.0
     for p in range(4):
@@ -356,14 +351,11 @@ def complete(c: OneArea, pace: Pace, s: LoopState) -> int:
 @jit_within
 def _write(c: OneArea, pace: Pace, s: LoopState, t: float) -> None:
     """Charge of a step that began at t (s), and its outputs."""
-    system, r, step, level, x = c.system, c.work.r, s.step[0], s.step[0].level, c.work.modal
-    model, shown, values = system.model, system.shown[level], x.values
+    system, r, step, x = c.system, c.work.r, s.step[0], c.work.modal
+    model, shown, values = system.model, system.shown[step.level], x.values
     n_shown = shown.shape[0]
     if pace.charge:
-        charge_step(
-            system, c.work, level, c.integral, step.length, s.y[x.w0.size], step.theta, s.control[0], s.collected,
-            values[n_shown], values[n_shown + 1],
-        )  # fmt: skip
+        charge_step(c, s, values[n_shown], values[n_shown + 1])
     if not readout.is_wanted(s, step.t_new):
         return
     readout.layers(model.mobile, model.area0, system.k_shown, shown, x.w, r[SOURCE], r[Q], values)
@@ -412,12 +404,10 @@ def _cross(c: OneArea, s: LoopState) -> bool:
     # The area has a kink here, which excites fast modes again: the first step is chosen as after other zeros.
     if step.below > 0.0:
         # The gap voltage returns to 0 V soon.
-        control.h = 2.0 * (step.below - step.theta) * step.length
-        control.allowed = 0.0
+        control.h, control.allowed = 2.0 * (step.below - step.theta) * step.length, 0.0
     elif control.h_after_zero > 0.0:
-        control.h = control.h_after_zero
-        control.allowed = 0.0
-    s.step[0].fresh = step_control.AFTER_ZERO
+        control.h, control.allowed = control.h_after_zero, 0.0
+    step.fresh = step_control.AFTER_ZERO
     return True
 
 
