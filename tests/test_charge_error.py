@@ -20,14 +20,7 @@ from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.readout import N_PLACES
 from fingerspice.engine.many_areas import error as many_charge
 from fingerspice.engine.many_areas import form as blocks
-from fingerspice.engine.many_areas.coupling import (
-    STIFF,
-    Moving,
-    answer_mobile,
-    cell_currents,
-    fill_coupling,
-    new_coupling,
-)
+from fingerspice.engine.many_areas.coupling import STIFF, take_coupling
 from fingerspice.engine.many_areas.form import Form
 from fingerspice.engine.one_area import charge, rows
 from fingerspice.engine.one_area.model import Model
@@ -294,18 +287,21 @@ class Net:
         return value
 
 
-def form_of(step: Net) -> Form:
-    """What of a form the charges of a network need."""
+def form_with(**own: object) -> Form:
+    """A form with these fields alone."""
     parts = {name: np.zeros((0, 0)) for name in Form._fields}
     flat = ("numbers", "rates", "area0", "size", "c", "g", "unit", "pace", "stress", "lo", "scale")
-    parts |= {name: np.zeros(0) for name in flat}
-    own = {
-        "stored": step.stored[None, :], "lost": step.lost[None, :], "through": step.through[None, :], "tap": step.tap,
-        "c": step.c, "g": step.g, "home": np.zeros(2, np.int64), "first": np.array([0, 2]),
-        "cell": np.zeros(1, np.int64), "unit": np.array([A0]), "slow": np.array([2 if step.slow else -1]),
-        "mobile": step.mobile,
-    }  # fmt: skip
+    parts |= {name: np.zeros(0) for name in flat} | {name: np.zeros(0, np.int64) for name in ("home", "first", "slow")}
     return Form(**(parts | own))
+
+
+def form_of(step: Net) -> Form:
+    """What of a form the charges of a network need."""
+    return form_with(
+        stored=step.stored[None, :], lost=step.lost[None, :], through=step.through[None, :], tap=step.tap, c=step.c,
+        g=step.g, home=np.zeros(2, np.int64), first=np.array([0, 2]), cell=np.zeros(1, np.int64), unit=np.array([A0]),
+        slow=np.array([2 if step.slow else -1]), mobile=step.mobile,
+    )  # fmt: skip
 
 
 def engine_charge(
@@ -313,17 +309,14 @@ def engine_charge(
 ) -> tuple[np.ndarray, np.ndarray]:
     """What stayed (2,) and `control` after the engine's account of a step."""
     _, u, area = step.at(POINTS, 0.0)
-    areas = np.zeros((8, 1, ROWS))
-    areas[blocks.AREA], areas[blocks.MORE] = area, area - A0
-    areas[blocks.SLOPE] = 0.0 if step.slow else slope_at(u[0])
     z = np.array([[step.charge(x, 0.0) for x in POINTS]])
     control, collected = np.zeros(1, readout.CONTROL)[0], np.array([[before], [0.0]])
     form = form_of(step)
     work = blocks.new_network_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
-    work.places[:], work.off[:, : len(places)] = places, missed
-    many_charge.charge_error(
-        form, work, H, step.lost[None, :], step.g, theta, np.ascontiguousarray(u), areas, z, collected, control
-    )
+    work.areas[blocks.AREA], work.areas[blocks.MORE] = area, area - A0
+    work.areas[blocks.SLOPE] = 0.0 if step.slow else slope_at(u[0])
+    work.cells[blocks.CELL_U], work.modal.places[:], work.off[:, : len(places)] = u, places, missed
+    many_charge.charge_error(form, work, H, theta, z, collected, control)
     return collected[:, 0], control
 
 
@@ -437,26 +430,23 @@ def cells(seed: int, sizes: tuple[int, ...], fast: int) -> SimpleNamespace:
 @pytest.mark.parametrize("seed", range(3))
 def test_currents_and_the_distance_to_the_fold_under_mobile(seed: int, sizes: tuple[int, ...], fast: int) -> None:
     given = cells(seed, sizes, fast)
-    n_f, n_area = len(given.c), len(sizes)
-    x = new_coupling(given.tap.shape[1], n_f, 1)
-    fill_coupling(
-        x, H, given.rates, -given.tap.T.copy(), given.tap, given.tap_s, given.c, given.g, given.home, given.cell
-    )
+    n, n_f, n_area = given.tap.shape[1], len(given.c), len(sizes)
+    work = blocks.new_network_work(n, n, n_f, n_area, 1, 1)
+    form = form_with(
+        rates=given.rates, feed=-given.tap.T.copy(), tap=given.tap, tap_s=given.tap_s, c=given.c, g=given.g,
+        home=given.home, cell=given.cell, first=np.searchsorted(given.home, np.arange(n_area + 1)), mobile=True,
+    )  # fmt: skip
+    x = work.own
+    take_coupling(x, 0, H, form)
     eta = x.from_modes @ given.w + x.from_rates @ given.lin + x.from_stiff @ given.d
     eta += x.from_slopes @ given.ds + x.from_sources @ given.s
-    chi = np.ascontiguousarray(x.held @ given.w + x.from_slopes @ given.s)
-    rho, share, known = np.zeros((n_f, ROWS)), np.zeros((n_f, ROWS)), np.zeros((n_area, ROWS))
-    least, first = np.zeros(ROWS), np.searchsorted(given.home, np.arange(n_area + 1))
-    moving = Moving(
-        given.u[given.cell].copy(), given.more, given.slope, given.rate, chi, eta, rho, known, share
-    )  # fmt: skip
-    answer_mobile(
-        n_area > 1, x, given.home, first, given.cell, moving, np.zeros((n_f, n_area + 1, ROWS)),
-        np.zeros((n_f, n_f + 1, ROWS)), least,
-    )  # fmt: skip
+    work.cells[blocks.ETA], work.cells[blocks.CHI] = eta, x.held @ given.w + x.from_slopes @ given.s
+    work.areas[blocks.U], work.areas[blocks.MORE] = given.u[given.cell], given.more
+    work.areas[blocks.SLOPE], work.areas[blocks.RATE] = given.slope, given.rate
+    least = np.zeros(ROWS)
+    blocks.answer_mobile(form, work, n_area > 1, work.cells, work.areas, least)
     want, distance = solved(given)
-    j = np.empty_like(rho)
-    cell_currents(x.root, rho, j)
+    j = x.root @ work.cells[blocks.RHO]
     np.testing.assert_allclose(j, want, rtol=0.0, atol=1e-10 * np.abs(want).max())
     np.testing.assert_allclose(least, distance, rtol=1e-10)
 

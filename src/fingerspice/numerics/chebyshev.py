@@ -86,18 +86,8 @@ def series_through(values: FloatArray, tol: float, c: FloatArray) -> int:
 @jit
 def evaluate(c: FloatArray, x: float) -> tuple[float, float]:
     """Value and derivative at x in [-1, 1] of the series with coefficients c (Clenshaw)."""
-    b1 = 0.0
-    b2 = 0.0
-    d1 = 0.0
-    d2 = 0.0
-    for k in range(c.size - 1, 0, -1):
-        d0 = 2.0 * b1 + 2.0 * x * d1 - d2
-        b0 = c[k] + 2.0 * x * b1 - b2
-        d2 = d1
-        d1 = d0
-        b2 = b1
-        b1 = b0
-    return c[0] + x * b1 - b2, b1 + x * d1 - d2
+    value, slope, _ = _value_slope_bend(c, x)
+    return value, slope
 
 
 _BLOCK = 256
@@ -245,14 +235,14 @@ def largest(values: FloatArray, sign: float) -> tuple[int, float, float]:
             series[d] = 0.0
             for i in range(NODES):
                 series[d] += TO_SERIES[i, d] * sign * values[p, i]
-        x, top = _summit(series, 2.0 * POINTS[max(j - 1, 0)] - 1.0, 2.0 * POINTS[min(j + 1, NODES - 1)] - 1.0)
+        x, top = summit(series, 2.0 * POINTS[max(j - 1, 0)] - 1.0, 2.0 * POINTS[min(j + 1, NODES - 1)] - 1.0)
         if top > best:
             panel, place, best = p, 0.5 * (1.0 + x), top
     return panel, place, best
 
 
 @jit
-def _summit(series: FloatArray, lo: float, hi: float) -> tuple[float, float]:
+def summit(series: FloatArray, lo: float, hi: float) -> tuple[float, float]:
     """Where in [lo, hi] a Chebyshev series is largest, and its value there: by Newton in a bracket of its slope."""
     x = 0.5 * (lo + hi)
     value = 0.0
@@ -272,11 +262,11 @@ def _summit(series: FloatArray, lo: float, hi: float) -> tuple[float, float]:
 
 
 @jit
-def _value_slope_bend(series: FloatArray, x: float) -> tuple[float, float, float]:
-    """A Chebyshev series at x in [-1, 1] with its first two derivatives (Clenshaw)."""
+def _value_slope_bend(c: FloatArray, x: float) -> tuple[float, float, float]:
+    """The series with coefficients c at x in [-1, 1] with its first two derivatives (Clenshaw)."""
     b1, b2, d1, d2, e1, e2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(NODES - 1, 0, -1):
+    for k in range(c.size - 1, 0, -1):
         e1, e2 = 4.0 * d1 + 2.0 * x * e1 - e2, e1
         d1, d2 = 2.0 * b1 + 2.0 * x * d1 - d2, d1
-        b1, b2 = 2.0 * x * b1 - b2 + series[k], b1
-    return x * b1 - b2 + series[0], b1 + x * d1 - d2, 2.0 * d1 + x * e1 - e2
+        b1, b2 = c[k] + 2.0 * x * b1 - b2, b1
+    return c[0] + x * b1 - b2, b1 + x * d1 - d2, 2.0 * d1 + x * e1 - e2

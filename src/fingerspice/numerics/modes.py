@@ -34,6 +34,16 @@ def copy_to(out: FloatArray, x: FloatArray) -> None:
 
 
 @jit
+def apply(matrix: FloatArray, x: FloatArray, out: FloatArray) -> None:
+    """out = matrix @ x, of the first entries of both."""
+    for k in range(matrix.shape[0]):
+        total = 0.0
+        for i in range(matrix.shape[1]):
+            total += matrix[k, i] * x[i]
+        out[k] = total
+
+
+@jit
 def invert(matrix: FloatArray | ComplexArray) -> bool:
     """Invert a matrix (n, n) in place by Gauss-Jordan elimination with row pivoting; False where it is singular."""
     n = matrix.shape[0]

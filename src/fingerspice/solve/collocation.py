@@ -17,10 +17,10 @@ from fingerspice.base.arrays import FloatArray, IntArray, views_of
 from fingerspice.circuit.network import Modes, Network
 from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
-from fingerspice.engine.collocation.exponential import forget, new_tables
+from fingerspice.engine.collocation.exponential import new_tables
 from fingerspice.engine.collocation.loop import Looks, no_looks
 from fingerspice.engine.collocation.step_control import end_row
-from fingerspice.engine.many_areas.form import REFERRED, Form, new_network_work
+from fingerspice.engine.many_areas.form import REFERRED, Form, held, new_network_work
 from fingerspice.engine.many_areas.step import ManyAreas, References
 from fingerspice.engine.network import Sources, source
 from fingerspice.engine.one_area import system as systems
@@ -74,7 +74,7 @@ class _Scratch(threading.local):
         tables, work, before = self.by_size.get(n) or (new_tables(n), new_stack_work(n), None)
         if before is not system:
             self.by_size[n] = tables, work, system
-            forget(tables)
+            tables.used[:] = 0
         return tables, work
 
 
@@ -342,7 +342,7 @@ class March(Stepping):
         self.shortest = problem.waveform.shortest_time()
         self.references = known_references(scene, self.decade)
         self.form = self.references.form()
-        cells = self.form.c.size
+        self.held, cells = held(self.form), self.form.c.size
         self.work = new_network_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
         scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
         self.look_for_period(self.form.rates, scale, repeat)
@@ -361,8 +361,8 @@ class March(Stepping):
     def circuit(self, sources: Sources) -> ManyAreas:
         known = self.references
         return ManyAreas(
-            self.form, known.arrays, known.tables, self.work, integral_table(), sources, self.u_scale, self.sign,
-            self.s_before, self.branch,
+            self.form, self.held, known.arrays, known.tables, self.work, integral_table(), sources, self.u_scale,
+            self.sign, self.s_before, self.branch,
         )  # fmt: skip
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:

@@ -12,9 +12,9 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
+from fingerspice.engine.collocation.readout import N_PLACES, Modal
 from fingerspice.engine.many_areas.form import evaluate_many, probe_many
-from fingerspice.engine.one_area.rows import DQ, SOURCE, X_GAP, Q, U, Work, evaluate_one, largest_size, probe_one
-from fingerspice.engine.one_area.system import System
+from fingerspice.engine.one_area.rows import evaluate_one, largest_size, probe_one
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 
 
@@ -32,23 +32,6 @@ def respond(forcing: FloatArray, phi: FloatArray, base: FloatArray, w: FloatArra
             w[k, i] = total + other
 
 
-class Iterates(NamedTuple):
-    """Arrays of the iteration, shape (m, ROWS) for the modes."""
-
-    # w, base, pull, used: The modes, and those without the nonlinear term; this term at them, and as used for them
-    w: FloatArray
-    base: FloatArray
-    pull: FloatArray
-    used: FloatArray
-    # pull_before, left_before: Nonlinear term and what was left of it an iteration before (see `mix`)
-    pull_before: FloatArray
-    left_before: FloatArray
-    weight: FloatArray  # (m,): See `weigh`
-    # u, guess (n_area, ROWS): Gap voltages now and an iteration before, V
-    u: FloatArray
-    guess: FloatArray
-
-
 # The nonlinear term of a circuit in a run at the modes of the step at hand, False beyond a fold; and at other modes,
 # with both as rows of `work.spare`.
 _evaluate = jit_by_kind(OneArea=evaluate_one, ManyAreas=evaluate_many)
@@ -56,36 +39,35 @@ _probe = jit_by_kind(OneArea=probe_one, ManyAreas=probe_many)
 
 
 @jit_within
-def converge(circuit: Any, state: Any, x: Iterates, tol: float) -> tuple[int, bool, float]:
-    """Fill `x.w` with the collocation solution of a step, iterating on the nonlinear term.
+def converge(circuit: Any, state: Any, tol: float) -> tuple[int, bool, float]:
+    """Fill `w` with the collocation solution of a step, iterating on the nonlinear term; for the arrays see `Modal`.
 
     Returns the number of evaluations at all rows, whether the iteration converged to `tol` (V), and the factor by which
     the first iteration reduced the change of the nonlinear term: how strongly the areas answer to a change of the
-    modes. `x.pull` is the nonlinear term at that solution, `x.used` the term from which the solution was computed.
-    Their difference is measured, with the weight of each mode, by how far it moves the gap voltages.
+    modes. `pull` is the nonlinear term at that solution, `used` the term from which the solution was computed. Their
+    difference is measured, with the weight of each mode, by how far it moves the gap voltages.
     """
-    pull, used, phi = x.pull, x.used, circuit.tables.phi[state.step[0].slot]
+    x, phi = circuit.work.modal, circuit.tables.phi[state.step[0].slot]
+    w, base, pull, used = x.w, x.base, x.pull, x.used
+    weight, pull_before, left_before, u, guess = x.weight, x.pull_before, x.left_before, x.u, x.guess
     for k in range(used.shape[0]):
         for i in range(ROWS):
-            x.w[k, i] = x.base[k, i]
+            w[k, i] = base[k, i]
             used[k, i] = 0.0
     slow = False
     step, answer = 0.0, 0.0
     # The loop includes the first evaluation: `evaluate` is inlined at each call, so that one call compiles once.
     for iteration in range(1, 41):
         if iteration > 1:
-            if slow:
-                step = mix(pull, used, x.weight, x.pull_before, x.left_before)
-            else:
-                step = plain(pull, used, x.weight, x.pull_before, x.left_before)
-            respond(used, phi, x.base, x.w)
+            step = move_on(pull, used, weight, pull_before, left_before, slow)
+            respond(used, phi, base, w)
         if not _evaluate(circuit, state):
             return iteration, False, answer
-        change = moved(x.u, x.guess)
+        change = moved(u, guess)
         if iteration == 1:
             continue
         # The next change of the gap voltages: their last one, times the ratio of the nonlinear term's changes.
-        left = distance(pull, used, x.weight)
+        left = distance(pull, used, weight)
         if iteration == 2 and step > 0.0:
             answer = left / step
         if not left < math.inf:
@@ -108,39 +90,35 @@ def moved(u: FloatArray, before: FloatArray) -> float:
     return math.sqrt(total)
 
 
-@jit
-def weigh(rates: FloatArray, gap: FloatArray, decay: FloatArray, h: float, weight: FloatArray) -> None:
-    """Move of the gap voltage over a step by a unit forcing of each mode, into `weight` (n,)."""
-    for k in range(rates.size):
-        weight[k] = gap[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
-
-
 @jit_rows
-def plain(
-    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
-) -> float:
-    """Picard step of the iteration, remembered for a later Anderson step (`mix`); returns the size of the move."""
+def move_on(
+    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray,
+    mixed: bool,
+) -> float:  # fmt: skip
+    """Next nonlinear term of the iteration, into `used`, and what a later one needs; returns the size of the move.
+
+    It is the last term (Picard) or, if `mixed`, made of the last two (Anderson 1965, one step back). In a stiff stack a
+    Picard step reduces the residual by a factor, the area's share of the leakage. Mixing squares it.
+    """
+    share = _share(pull, used, weight, left_before) if mixed else 0.0
     total = 0.0
     for k in range(pull.shape[0]):
         size = 0.0
         for i in range(ROWS):
-            left = pull[k, i] - used[k, i]
-            size += left * left
-            left_before[k, i] = left
+            left_before[k, i] = pull[k, i] - used[k, i]
+            # What was before may be no number at the first step.
+            new = pull[k, i] - share * (pull[k, i] - pull_before[k, i]) if share != 0.0 else pull[k, i]
             pull_before[k, i] = pull[k, i]
-            used[k, i] = pull[k, i]
+            move = new - used[k, i]
+            size += move * move
+            used[k, i] = new
         total += weight[k] * weight[k] * size
     return math.sqrt(total)
 
 
 @jit_rows
-def mix(
-    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
-) -> float:
-    """Next nonlinear term from the last two (Anderson 1965, one step back), into `used`; returns the size of the move.
-
-    In a stiff stack a Picard step reduces the residual by a factor, the area's share of the leakage. Mixing squares it.
-    """
+def _share(pull: FloatArray, used: FloatArray, weight: FloatArray, left_before: FloatArray) -> float:
+    """Share of the last term but one that leaves least of the residual."""
     across = 0.0
     along = 0.0
     for k in range(pull.shape[0]):
@@ -154,24 +132,12 @@ def mix(
         across += weight[k] * weight[k] * mine
         along += weight[k] * weight[k] * size
     share = across / along if along > 0.0 else 0.0
-    share = min(max(share, -1.0), 0.9)
-    total = 0.0
-    for k in range(pull.shape[0]):
-        size = 0.0
-        for i in range(ROWS):
-            left_before[k, i] = pull[k, i] - used[k, i]
-            new = pull[k, i] - share * (pull[k, i] - pull_before[k, i])
-            pull_before[k, i] = pull[k, i]
-            move = new - used[k, i]
-            size += move * move
-            used[k, i] = new
-        total += weight[k] * weight[k] * size
-    return math.sqrt(total)
+    return min(max(share, -1.0), 0.9)
 
 
 @jit_rows
 def distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
-    """Norm of the difference of two nonlinear terms, with the weight of each mode from `weigh`."""
+    """Norm of the difference of two nonlinear terms, with the weight of each mode."""
     total = 0.0
     for k in range(a.shape[0]):
         size = 0.0
@@ -189,9 +155,8 @@ class Tables(NamedTuple):
     """Exponentials and their integrals, by step length and reference area, computed when first needed."""
 
     h: FloatArray  # (n_slots,): Step length of each slot, s
-    # level, used: Reference area of each slot (-1: empty), and [slots in use, slot used last]
-    level: IntArray
-    used: IntArray
+    level: IntArray  # (n_slots,): Reference area of each slot; -1: empty
+    used: IntArray  # (1,): Slots in use
     # decay, phi, miss (n_slots, n, ...): The tables of `fill_table`, with `phi` and `miss` multiplied by h
     decay: FloatArray
     phi: FloatArray
@@ -204,56 +169,44 @@ def new_tables(n: int) -> Tables:
     return Tables(
         np.zeros(slots),
         np.full(slots, -1),
-        np.zeros(2, np.int64),
+        np.zeros(1, np.int64),
         np.zeros((slots, n, ROWS)),
         np.zeros((slots, n, NODES, ROWS)),
         np.zeros((slots, n, ROWS)),
     )
 
 
-def forget(tables: Tables) -> None:
-    """Empty the tables."""
-    tables.used[:] = 0
-
-
 @jit_within
-def take_tables(
-    tables: Tables, level: int, h: float, rates: FloatArray, gap: FloatArray, state: Any, weight: FloatArray
-) -> None:
-    """Take the tables of a step of length h (s) around a reference, and what its modes do to the gap (see `weigh`)."""
-    step = state.step[0]
-    step.slot = _make_tables(
-        rates, level, h, tables.h, tables.level, tables.used, tables.decay, tables.phi, tables.miss
-    )  # fmt: skip
-    step.tabled = h
-    weigh(rates, gap, tables.decay[step.slot], h, weight)
+def take_tables(circuit: Any, state: Any, level: int, h: float, rates: FloatArray, gap: FloatArray) -> None:
+    """Take the tables of a step of length h (s) around a reference; a unit of each mode moves the gap by `gap` (V)."""
+    step, tables, weight = state.step[0], circuit.tables, circuit.work.modal.weight
+    step.slot, step.tabled = _make_tables(tables, rates, level, h), h
+    decay = tables.decay[step.slot]
+    for k in range(rates.size):
+        weight[k] = gap[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
 
 
 @jit
-def _make_tables(
-    rates: FloatArray, level: int, h: float, keys_h: FloatArray, keys_level: IntArray, count: IntArray,
-    decay: FloatArray, phi: FloatArray, miss: FloatArray,
-) -> int:  # fmt: skip
+def _make_tables(tables: Tables, rates: FloatArray, level: int, h: float) -> int:
     """The slot with the tables of a step, filled now if need be; when all are in use the oldest is overwritten."""
-    slots = keys_h.size
+    count, slots = tables.used, tables.h.size
     for slot in range(min(count[0], slots)):
-        if keys_h[slot] == h and keys_level[slot] == level:
-            count[1] = slot
+        if tables.h[slot] == h and tables.level[slot] == level:
             return slot
     slot = int(count[0] % slots)
     count[0] += 1
     # A count beyond the slots tells only that all are in use and which is next: it is kept below twice their number.
     if count[0] >= 2 * slots:
         count[0] -= slots
-    count[1] = slot
-    keys_h[slot] = h
-    keys_level[slot] = level
+    tables.h[slot] = h
+    tables.level[slot] = level
+    phi, miss = tables.phi[slot], tables.miss[slot]
     for k in range(rates.size):
-        fill_table(rates[k] * h, decay[slot, k], phi[slot, k], miss[slot, k])
+        fill_table(rates[k] * h, tables.decay[slot, k], phi[k], miss[k])
         for i in range(ROWS):
-            miss[slot, k, i] *= h
+            miss[k, i] *= h
             for j in range(NODES):
-                phi[slot, k, j, i] *= h
+                phi[k, j, i] *= h
     return slot
 
 
@@ -312,7 +265,7 @@ def _add(a: FloatArray, factor: float, b: FloatArray, out: FloatArray) -> None:
 
 
 @jit_within
-def carry(circuit: Any, state: Any, x: Iterates, gap: FloatArray, answer: float) -> None:
+def carry(circuit: Any, state: Any, gap: FloatArray, answer: float) -> None:
     """Carry the error of the modes from the start of a converged step to the points between and the end.
 
     With the areas held it decays with the modes. But an error of a gap voltage also changes 1/A, which forces the
@@ -321,100 +274,84 @@ def carry(circuit: Any, state: Any, x: Iterates, gap: FloatArray, answer: float)
     nonlinear term is evaluated once more at modes shifted by the error, and the response to its change is iterated as
     the step itself was (`converge`). `answer` is how strongly the areas answered there to a change of the modes: where
     they hardly do, the error decays with the modes. The shift is small beside the gap voltages, in which alone the
-    nonlinear term is not linear; `gap` (n_area, n) is how far a mode moves them. The result is `work.carried`.
+    nonlinear term is not linear; `gap` (n_area, n) is how far a mode moves them. The result is `carried`.
     """
-    work, error, slot = circuit.work, state.error, state.step[0].slot
-    base, used, off, shifted, other = work.spare[0], work.spare[1], work.spare[2], work.spare[3], work.spare[4]
-    decay, phi, carried = circuit.tables.decay[slot], circuit.tables.phi[slot], work.carried
+    x, error, slot = circuit.work.modal, state.error, state.step[0].slot
+    base, used, off, shifted, other = x.spare[0], x.spare[1], x.spare[2], x.spare[3], x.spare[4]
+    decay, phi, carried, w = circuit.tables.decay[slot], circuit.tables.phi[slot], x.carried, x.w
     largest_u, reach = largest_size(x.u.ravel()), 0.0
-    for k in range(x.w.shape[0]):
+    for k in range(w.shape[0]):
         for a in range(gap.shape[0]):
             # A slow area is a mode behind the others, in units of its area at 0 V.
             reach = max(reach, abs((gap[a, k] if k < gap.shape[1] else largest_u) * error[k]))
     shift = _SHIFT * largest_u
     answers = answer > _SLIGHT and 0.0 < shift / reach < math.inf
     scale = shift / reach if answers else 1.0
-    for k in range(x.w.shape[0]):
+    for k in range(w.shape[0]):
         for i in range(ROWS):
             off[k, i] = base[k, i] = scale * decay[k, i] * error[k]
             used[k, i] = 0.0
     for iteration in range(_PASSES if answers else 0):
-        _add(x.w, 1.0, off, shifted)
+        _add(w, 1.0, off, shifted)
         if not _probe(circuit, state, shifted, other):
             break
         _add(other, -1.0, x.pull, shifted)
-        if iteration > 0:
-            move = mix(shifted, used, x.weight, x.pull_before, x.left_before)
-        else:
-            move = plain(shifted, used, x.weight, x.pull_before, x.left_before)
+        move = move_on(shifted, used, x.weight, x.pull_before, x.left_before, iteration > 0)
         respond(used, phi, base, off)
         if not move > _ENOUGH * shift:
             break
-    for k in range(x.w.shape[0]):
+    for k in range(w.shape[0]):
         for p in range(3):
             carried[k, p] = off[k, NODES + p] / scale
         carried[k, 3] = off[k, END] / scale
 
 
-@jit_within
-def assess(
-    system: System, tables: Tables, work: Work, slot: int, level: int, error: FloatArray
-) -> tuple[float, float]:  # fmt: skip
-    """Error of a converged step: interpolation error between the nodes, residual of the iteration, earlier error.
+# Three numbers, at the points between the nodes.
+Three = tuple[float, float, float]
 
-    `work.carried` is the error of the modes propagated to the points between nodes and to the end (see `carry`), and
-    `error` (n,) that at the start, signed; `work.places` is filled with their error at the start, the points between
-    and the end, that of the dense output included. `work.run` takes the whole error of the gap voltage there. Returned
-    are the largest error of the gap voltage by this step's interpolation alone (V), which controls the step's length,
-    and the largest ratio of a move of the gap voltage to the move of a state voltage that causes it.
+
+@jit_within
+def mode_error(
+    x: Modal, k: int, lin: Three, tables: Tables, slot: int, rows: tuple[int, int, int, int], magnified: float,
+    error: float, off: FloatArray,
+) -> Three:  # fmt: skip
+    """Fill `places` with the errors of mode k at a step's start, the points between its nodes, and its end.
+
+    They are the interpolation error of the forcing, of which `lin` is that of the linear part; the residual of the
+    iteration; and the `error` at the start as carried on. The first has the response at `rows`, which goes into `off`
+    (4, m); it and the second are `magnified`. Returned is the interpolation error of the mode itself.
     """
-    r, w, pull, used, carried, places, sums = (
-        work.r, work.w, work.pull, work.used, work.carried, work.places, work.sums
-    )  # fmt: skip
-    gain, gap, phi, miss = system.gain[level], system.gap[level], tables.phi[slot], tables.miss[slot]
-    mobile, area0 = system.model.mobile, system.model.area0
-    source_first, source_second, source_third = between(r[SOURCE])
-    # Outputs are read from the polynomial through the gap voltages at the nodes: its interpolation error counts.
-    sums[0, 0], sums[0, 1], sums[0, 2] = between(r[U])
-    sums[0, 3] = 0.0
+    pull, left, miss = between(x.pull[k]), x.spare[5, k], tables.miss[slot, k]
+    places, carried = x.places[k], x.carried[k]
+    missed = largest((lin[0] + pull[0]) / MISS[0], (lin[1] + pull[1]) / MISS[1], (lin[2] + pull[2]) / MISS[2])
+    left_over(tables.phi[slot, k], x.pull[k], x.used[k], left)
+    places[0] = error
     for p in range(4):
-        sums[1, p] = 0.0
-        sums[2, p] = 0.0
-    for k in range(gain.size):
-        pull_first, pull_second, pull_third = between(pull[k])
-        mode_first, mode_second, mode_third = between(w[k])
-        missed = largest(
-            (gain[k] * source_first + pull_first) / MISS[0],
-            (gain[k] * source_second + pull_second) / MISS[1],
-            (gain[k] * source_third + pull_third) / MISS[2],
-        )
-        left = sums[3]
-        left_over(phi[k], pull[k], used[k], left)
-        places[k, 0] = error[k]
-        for p in range(4):
-            row = FIRST + p if p < 3 else END
-            fresh = miss[k, row] * missed
-            places[k, p + 1] = carried[k, p] + left[p] + fresh
-            sums[1, p] += gap[k] * fresh
-            sums[2, p] += gap[k] * places[k, p + 1]
-        places[k, 1] += mode_first
-        places[k, 2] += mode_second
-        places[k, 3] += mode_third
-    step = 0.0
-    magnified = 1.0
-    work.run[0] = 0.0
-    for p in range(4):
-        row = FIRST + p if p < 3 else END
-        factor = 1.0
-        if mobile:
-            # The modes' part of the gap voltage is multiplied by A_0 / A, and its error grows near the fold.
-            factor = area0 * r[Q, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
-            magnified = max(magnified, factor)
-        step = max(step, abs(factor * sums[1, p] + sums[0, p]))
-        work.run[p + 1] = abs(factor * sums[2, p] + sums[0, p])
-    # The charge contains the integral of A dU: the interpolation error of 1/A counts times the change of the source.
-    area_first, area_second, area_third = between(r[Q])
-    swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
-    missed = abs(largest(area_first / MISS[0], area_second / MISS[1], area_third / MISS[2]))
-    charged = swing * missed / r[Q, 0]
-    return max(step, charged), magnified
+        off[p, k] = magnified * miss[rows[p]] * missed
+        places[p + 1] = carried[p] + magnified * left[p] + off[p, k]
+    return between(x.w[k])
+
+
+@jit_rows
+def node_error(
+    node: FloatArray, node_s: FloatArray, places: FloatArray, off: FloatArray, error: FloatArray
+) -> float:  # fmt: skip
+    """Largest error of any node's voltage over a step (V), from that of the modes and the sources.
+
+    `off` (N_PLACES, m + n_s) has the interpolation errors of the sources behind those of the modes, and in its last row
+    those of the modes at the start; `error` (m, ROWS) is scratch.
+    """
+    m, n, worst = places.shape[0], node.shape[1], 0.0
+    for k in range(n):
+        for p in range(N_PLACES):
+            error[k, p] = places[k, p] + (off[4, k] if p == 0 else 0.0)
+    for i in range(node.shape[0]):
+        for p in range(N_PLACES):
+            total = 0.0
+            for k in range(n):
+                total += node[i, k] * error[k, p]
+            if 0 < p < N_PLACES - 1:
+                for e in range(node_s.shape[1]):
+                    total += node_s[i, e] * off[p - 1, m + e]
+            worst = max(worst, abs(total))
+    return worst

@@ -97,6 +97,46 @@ class Outputs(NamedTuple):
     columns: FloatArray  # (n_column, n_out): To be filled
 
 
+class Modal(NamedTuple):
+    """Arrays of the modes of a step, and of what is read from them; those with ROWS behind have a value at each row."""
+
+    # w, base, pull, used (m, ROWS): The modes, and those without the nonlinear term; this term at them, and as used for
+    # them
+    w: FloatArray
+    base: FloatArray
+    pull: FloatArray
+    used: FloatArray
+    # pull_before, left_before (m, ROWS): Nonlinear term and what was left of it an iteration before
+    pull_before: FloatArray
+    left_before: FloatArray
+    spare: FloatArray  # (6, m, ROWS): Scratch
+    # w0, weight (m,): The modes at the start of the step; move of the gap voltage over it by a unit forcing of each
+    w0: FloatArray
+    weight: FloatArray
+    # places, carried (m, N_PLACES) and (m, N_PLACES - 1): Errors of the modes, and those carried over from earlier
+    # steps
+    places: FloatArray
+    carried: FloatArray
+    run: FloatArray  # (n_area, N_PLACES): Errors of the gaps' voltages, V
+    # values, coefficients (n_column, ROWS): Output columns and their Chebyshev coefficients
+    values: FloatArray
+    coefficients: FloatArray
+    outputs: FloatArray  # (2, WRITTEN_AT_ONCE): Scratch
+    basis: FloatArray  # (NODES,): See `readout.basis_at`
+    # u, guess (n_area, ROWS): Gap voltages now and an iteration before, V
+    u: FloatArray
+    guess: FloatArray
+
+
+def new_modal(m: int, columns: int, u: FloatArray, guess: FloatArray) -> Modal:
+    """Arrays for m modes and so many output columns, beside those of the gap voltages."""
+    z, rows, wide = np.zeros, (m, ROWS), (columns, ROWS)
+    return Modal(
+        z(rows), z(rows), z(rows), z(rows), z(rows), z(rows), z((6, m, ROWS)), z(m), z(m), z((m, N_PLACES)),
+        z((m, N_PLACES - 1)), z((len(u), N_PLACES)), z(wide), z(wide), z((2, WRITTEN_AT_ONCE)), z(NODES), u, guess,
+    )  # fmt: skip
+
+
 @jit_rows
 def series_of(values: FloatArray, out: FloatArray) -> None:
     """Chebyshev coefficients (ROWS,) of the polynomial through values at the nodes."""
@@ -141,24 +181,18 @@ def row_of(place: int) -> int:
 
 
 @jit
-def error_at(places: FloatArray, theta: float, error: FloatArray) -> None:
-    """Error of the modes at the end of a step that is cut short, interpolated between the places where it is known."""
-    p = 0
+def end_at(theta: float, x: Modal, error: FloatArray) -> None:
+    """The modes at fraction `theta` of the step, to which `basis` belongs, and their error, into `w0` and `error`.
+
+    The error is interpolated between the places where it is known.
+    """
+    w, w0, places, basis, p = x.w, x.w0, x.places, x.basis, 0
     while p < N_PLACES - 2 and theta > _AT[p + 1]:
         p += 1
     share = (theta - _AT[p]) / (_AT[p + 1] - _AT[p])
-    for k in range(places.shape[0]):
-        error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
-
-
-@jit
-def end_at(
-    theta: float, w: FloatArray, places: FloatArray, basis: FloatArray, w0: FloatArray, error: FloatArray
-) -> None:
-    """The modes, and their error, at fraction `theta` of the step, to which `basis` belongs."""
     for k in range(w0.size):
         w0[k] = at(w[k], basis)
-    error_at(places, theta, error)
+        error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
 
 
 @jit_rows
@@ -474,13 +508,9 @@ def is_wanted(s: LoopState, t_new: float) -> bool:
 
 
 @jit_within
-def write_step(s: LoopState, t: float, values: FloatArray, coefficients: FloatArray, work: FloatArray) -> None:
-    """Record a finished step that began at t (s), keep it for repetition, and write its outputs.
-
-    `values` (n_column, ROWS) are the columns at the rows of the step; `coefficients` takes their Chebyshev
-    coefficients.
-    """
-    counters, kept_times = s.counters, s.kept.times
+def write_step(s: LoopState, t: float, x: Modal) -> None:
+    """Record a finished step that began at t (s), keep it for repetition, and write its outputs."""
+    counters, kept_times, values, coefficients = s.counters, s.kept.times, x.values, x.coefficients
     h, theta, t_new = s.step[0].length, s.step[0].theta, s.step[0].t_new
     if s.steps.times.shape[0] > 0:
         times, nodes, place = s.steps.times, s.steps.values, counters[RECORDED]
@@ -502,5 +532,5 @@ def write_step(s: LoopState, t: float, values: FloatArray, coefficients: FloatAr
         copy_to(s.kept.series[place], coefficients[: s.outputs.columns.shape[0]])
     if has_outputs:
         counters[OUTPUT] += write_outputs(
-            t, h, theta, t_new, 0.0, False, coefficients, work, first, 0, s.outputs
+            t, h, theta, t_new, 0.0, False, coefficients, x.outputs, first, 0, s.outputs
         )  # fmt: skip

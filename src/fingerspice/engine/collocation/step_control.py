@@ -16,14 +16,14 @@ from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.collocation.readout import Control, series_of
 from fingerspice.engine.network import Segment, source
 from fingerspice.engine.one_area.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp, write_row_at
-from fingerspice.numerics.chebyshev import evaluate
+from fingerspice.numerics.chebyshev import evaluate, summit
 from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS
 
 # Ratio of neighbouring step lengths of the ladder, as a power of two: small enough to waste little, large enough for
 # lengths to recur, whose tables are kept.
 _RUNGS = 16.0
 # A step that is to reach a zero of the gap voltage is this much longer, relative to its length.
-_BEYOND = 1.02
+BEYOND = 1.02
 # Largest ratio of a step to the one before, and the part of it that may come from the trend of earlier steps.
 _MOST_GROWTH, _MOST_TREND = 8.0, 2.5
 # If the error allows a step so many times as long as one that was rejected, the reason of the rejection has passed.
@@ -116,7 +116,7 @@ def choose_step(
     if h == 0.0:
         h = 4.0 * tau
     h = min(h, pace.h_max)
-    ahead = control.branch_start + _BEYOND * control.branch_length - t
+    ahead = control.branch_start + BEYOND * control.branch_length - t
     target = remaining
     if coupled and 0.0 < ahead < remaining:
         target = ahead
@@ -185,20 +185,6 @@ def rung(h: float) -> float:
     return out
 
 
-@jit
-def change_level(live: FloatArray, project: FloatArray, old: int, new: int, error: FloatArray) -> None:
-    """Carry the modes' error from one reference area to another."""
-    n = live.shape[1]
-    x = np.zeros(n)
-    for i in range(n):
-        for k in range(n):
-            x[i] += live[old, i, k] * error[k]
-    for k in range(n):
-        error[k] = 0.0
-        for i in range(n):
-            error[k] += project[new, k, i] * x[i]
-
-
 @jit_rows
 def slope_at(u: FloatArray, j: int) -> float:
     """Slope at node j of the polynomial through values at the nodes, per step."""
@@ -227,16 +213,11 @@ def dip(u: FloatArray, sign: float, tol: float, wrong: int, series: FloatArray) 
         if not (sign * slope_at(u, max(j - 1, 0)) < 0.0 < sign * slope_at(u, min(j + 1, NODES - 1))):
             continue
         series_of(u, series)
-        for _ in range(40):
-            mid = 0.5 * (lo + hi)
-            _, slope = evaluate(series, 2.0 * mid - 1.0)
-            if sign * slope < 0.0:
-                lo = mid
-            else:
-                hi = mid
-        lowest, _ = evaluate(series, lo + hi - 1.0)
-        if sign * lowest < -tol:
-            return float(0.5 * (lo + hi))
+        for d in range(NODES):
+            series[d] *= -sign
+        x, farthest = summit(series, 2.0 * lo - 1.0, 2.0 * hi - 1.0)
+        if farthest > tol:
+            return float(0.5 * (1.0 + x))
     return 0.0
 
 

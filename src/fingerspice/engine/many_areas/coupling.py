@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray, views_of
-from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.numerics.modes import copy_to, diagonalise
 
@@ -91,14 +91,11 @@ def new_coupling(n: int, cells: int, sources: int) -> Coupling:
 
 
 @jit
-def take_coupling(
-    out: Coupling, which: int, h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, tap_s: FloatArray,
-    c: FloatArray, g: FloatArray, home: IntArray, cell: IntArray,
-) -> None:  # fmt: skip
+def take_coupling(out: Coupling, which: int, h: float, form: Any) -> None:
     """Set `out` to coupling `which` for steps of length h (s), from the cache or anew; with h = 0 no mode is stiff."""
     stiff = 0
-    for k in range(rates.size):
-        if rates[k] * h > STIFF:
+    for k in range(form.rates.size):
+        if form.rates[k] * h > STIFF:
             stiff += 1
     if out.key[0] == which and out.key[1] == stiff:
         return
@@ -108,7 +105,7 @@ def take_coupling(
         if out.keys[slot, 0] == which and out.keys[slot, 1] == stiff:
             copy_to(out.numbers, out.kept[slot])
             return
-    fill_coupling(out, h, rates, feed, tap, tap_s, c, g, home, cell)
+    _fill_coupling(out, h, form)
     slot = out.used[0] % room
     out.used[0] += 1
     out.keys[slot, 0], out.keys[slot, 1] = which, stiff
@@ -116,11 +113,10 @@ def take_coupling(
 
 
 @jit
-def fill_coupling(
-    out: Coupling, h: float, rates: FloatArray, feed: FloatArray, tap: FloatArray, tap_s: FloatArray, c: FloatArray,
-    g: FloatArray, home: IntArray, cell: IntArray,
-) -> None:  # fmt: skip
+def _fill_coupling(out: Coupling, h: float, form: Any) -> None:
     """Compute the coupling for steps of length h (s), with the eigenvectors of each area's cells."""
+    rates, feed, tap, tap_s, c, g = form.rates, form.feed, form.tap, form.tap_s, form.c, form.g
+    home, cell = form.home, form.cell
     n_f, n = tap.shape
     met = np.zeros((n_f, n_f))
     for p in range(n_f):
@@ -192,7 +188,7 @@ def answer_alone(home: IntArray, answer: FloatArray, more: FloatArray, eta: Floa
 
 
 @jit_rows
-def _distance_of_area(
+def distance_of_area(
     answer: FloatArray, gap: FloatArray, first: int, last: int, more: FloatArray, slope: FloatArray, chi: FloatArray,
     factor: FloatArray,
 ) -> None:  # fmt: skip
@@ -205,7 +201,7 @@ def _distance_of_area(
 
 
 @jit_rows
-def _rate_of_area(
+def rate_of_area(
     answer: FloatArray, gap: FloatArray, leak: float, first: int, last: int, u: FloatArray, more: FloatArray,
     slope: FloatArray, rate: FloatArray, factor: FloatArray, known: FloatArray, share: FloatArray,
 ) -> None:  # fmt: skip
@@ -221,7 +217,7 @@ def _rate_of_area(
 
 
 @jit_rows
-def _fill_matrix(
+def fill_matrix(
     slopes: bool, home: IntArray, answer: FloatArray, cross: FloatArray, more: FloatArray, eta: FloatArray,
     known: FloatArray, share: FloatArray, mixed: FloatArray, matrix: FloatArray,
 ) -> None:  # fmt: skip
@@ -248,7 +244,7 @@ def _fill_matrix(
 
 
 @jit_rows
-def _eliminate(matrix: FloatArray, inverse: FloatArray, least: FloatArray, divide: bool) -> None:
+def eliminate(matrix: FloatArray, inverse: FloatArray, least: FloatArray, divide: bool) -> None:
     """Solve the systems (n, n + 1, ROWS) of all rows at once; the solutions replace the last column.
 
     No pivots are sought: the matrices differ from the unit matrix by as much as the areas move. `least` is multiplied
@@ -274,7 +270,7 @@ def _eliminate(matrix: FloatArray, inverse: FloatArray, least: FloatArray, divid
 
 
 @jit_rows
-def _mix(
+def mix(
     home: IntArray, answer: FloatArray, cross: FloatArray, more: FloatArray, chi: FloatArray, mixed: FloatArray
 ) -> None:
     """Derivative of eta by the rates A' of other areas, through their cells' chi, into `mixed` (n_f, n_area, ROWS)."""
@@ -291,7 +287,7 @@ def _mix(
 
 
 @jit_rows
-def _add_rates(
+def add_rates(
     home: IntArray, answer: FloatArray, more: FloatArray, chi: FloatArray, eta: FloatArray, known: FloatArray,
     share: FloatArray, rho: FloatArray,
 ) -> None:  # fmt: skip
@@ -303,59 +299,6 @@ def _add_rates(
         e = more[home[c]]
         for i in range(ROWS):
             rho[c, i] += chi[c, i] * known[home[c], i] / (1.0 + e[i] * answer[c])
-
-
-class Moving(NamedTuple):
-    """Rows of a step that the currents under `mobile` depend on, and those that receive them."""
-
-    # u, more, slope, rate (n_area, ROWS): Gap voltage, A - A0, dA/du, and the part of A' that does not come from the
-    # gap voltage
-    u: FloatArray
-    more: FloatArray
-    slope: FloatArray
-    rate: FloatArray
-    # chi, eta, rho (n_f, ROWS): See the module
-    chi: FloatArray
-    eta: FloatArray
-    rho: FloatArray
-    # known, share (n_area, ROWS): Scratch
-    known: FloatArray
-    share: FloatArray
-
-
-@jit_within
-def answer_mobile(
-    several: bool, x: Coupling, home: IntArray, first: IntArray, cell: IntArray, rows: Moving, mixed: FloatArray,
-    matrix: FloatArray, least: FloatArray,
-) -> None:  # fmt: skip
-    """rho under `mobile`, with all couplings of the areas; `least` (ROWS,) takes the distance to the fold.
-
-    This is the ratio of two determinants of the capacitances for small changes: with moving areas to with areas held.
-    """
-    answer, more, chi, eta, known, share = x.answer, rows.more, rows.chi, rows.eta, rows.known, rows.share
-    for i in range(ROWS):
-        least[i] = 1.0
-    spare = mixed[0, more.shape[0]]
-    for a in range(cell.size):
-        if cell[a] >= 0:
-            c, last = first[a], first[a + 1]
-            _distance_of_area(answer, x.gap, c, last, more[a], rows.slope[a], chi, spare)
-            _rate_of_area(
-                answer, x.gap, x.leak[c], c, last, rows.u[a], more[a], rows.slope[a], rows.rate[a], spare, known[a],
-                share,
-            )  # fmt: skip
-            for i in range(ROWS):
-                least[i] *= spare[i]
-    if several:
-        _fill_matrix(False, home, answer, x.cross, more, eta, known, share, mixed, matrix)
-        _eliminate(matrix, spare, least, True)
-        _mix(home, answer, x.cross, more, chi, mixed)
-        _fill_matrix(True, home, answer, x.cross, more, eta, known, share, mixed, matrix)
-        _eliminate(matrix, spare, least, False)
-        for b in range(answer.size):
-            copy_to(eta[b], matrix[b, answer.size])
-    answer_alone(home, answer, more, eta, rows.rho)
-    _add_rates(home, answer, more, chi, eta, known, share, rows.rho)
 
 
 @jit_rows
@@ -385,16 +328,3 @@ def answer_together(
                         rho[b, i] += x * rho[c, i]
             for i in range(ROWS):
                 rho[b, i] *= share[b, i]
-
-
-@jit_rows
-def cell_currents(root: FloatArray, rho: FloatArray, j: FloatArray) -> None:
-    """The cells' currents beside those at the reference areas (A), from rho."""
-    for b in range(root.shape[0]):
-        for i in range(ROWS):
-            j[b, i] = 0.0
-        for c in range(root.shape[0]):
-            share = root[b, c]
-            if share != 0.0:
-                for i in range(ROWS):
-                    j[b, i] += share * rho[c, i]

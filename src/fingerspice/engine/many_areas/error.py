@@ -6,19 +6,20 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.collocation.exponential import Tables, between, largest, left_over
-from fingerspice.engine.collocation.readout import ERROR_U, N_PLACES, Control, row_of
-from fingerspice.engine.collocation.step_control import first_wrong, leaves
+from fingerspice.engine.collocation.exponential import between, largest, mode_error
+from fingerspice.engine.collocation.readout import N_PLACES, Control, row_of
+from fingerspice.engine.collocation.step_control import first_wrong
 from fingerspice.engine.many_areas import form as forms
-from fingerspice.engine.many_areas.coupling import cell_currents
-from fingerspice.engine.many_areas.form import Form, Leaks, Work
+from fingerspice.engine.many_areas.form import Form, Work
 from fingerspice.engine.one_area.charge import LOBE, integrate
-from fingerspice.numerics.lobatto import DERIVATIVE, END, MISS, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import DERIVATIVE, END, NODES, POINTS, ROWS
+from fingerspice.numerics.modes import apply
 
 # A decay that is over within this fraction of the step, a third of the way to the first node, is not seen by the
 # polynomials.
@@ -50,10 +51,8 @@ def store(
 ) -> None:
     """State from the modes, the sources' values and the charges gained in the step."""
     n = shape.shape[0]
+    apply(shape, w, y)
     for i in range(n):
-        y[i] = 0.0
-        for k in range(n):
-            y[i] += shape[i, k] * w[k]
         for e in range(s.size):
             y[i] -= follow[i, e] * s[e]
     for k in range(n, w.size):
@@ -81,64 +80,43 @@ def _largest_voltage(shape: FloatArray, follow: FloatArray, m: int, off: FloatAr
 
 
 @jit_within
-def assess(
-    form: Form, work: Work, leaks: Leaks, tables: Tables, slot: int, h: float, error: FloatArray, magnified: float
-) -> float:  # fmt: skip
-    """Error of a converged step, V, from the interpolation errors between its nodes; see `exponential.assess`.
+def assess(c: Any, s: Any) -> float:
+    """Error of a converged step, V, from the interpolation errors between its nodes; see `exponential.mode_error`.
 
-    `work.places` receives the errors of the modes, `work.run` those of the gaps' voltages; both contain the residual of
+    `places` receives the errors of the modes, `run` those of the gaps' voltages; both contain the residual of
     the iteration and the errors of earlier steps. `work.off` receives the interpolation errors of the modes, and of the
     sources behind them, at the points between the nodes and at the end; its last row is that of a decay which is over
     before the first node.
     """
-    modes, s, off, places, run, carried, size = (
-        work.modes, work.s, work.off, work.places, work.run, work.carried, work.size
-    )  # fmt: skip
-    w, lin, pull, used = modes[forms.W], modes[forms.LIN], modes[forms.PULL], modes[forms.USED]
-    shape, follow, gap, rates, phi, miss = (
-        form.shape, form.follow, form.gap, leaks.rates, tables.phi[slot], tables.miss[slot]
-    )  # fmt: skip
-    n, m = shape.shape[0], w.shape[0]
-    left = work.room[2]
-    for j in range(s.shape[0]):
-        off[0, m + j], off[1, m + j], off[2, m + j] = between(s[j])
-    for k in range(w.shape[0]):
-        lin_first, lin_second, lin_third = between(lin[k])
-        pull_first, pull_second, pull_third = between(pull[k])
-        missed = largest(
-            (lin_first + pull_first) / MISS[0], (lin_second + pull_second) / MISS[1], (lin_third + pull_third) / MISS[2]
-        )
-        left_over(phi[k], pull[k], used[k], left)
-        places[k, 0] = error[k]
-        mode_first, mode_second, mode_third = between(w[k])
+    form, work, error, step, x = forms.form_of(c, s), c.work, s.error, s.step[0], c.work.modal
+    lin, off, size, h, magnified = work.lin, work.off, work.size, step.length, step.grown
+    w, pull, places, run, gap, rates = x.w, x.pull, x.places, x.run, form.gap, form.rates
+    n, m = gap.shape[1], w.shape[0]
+    for j in range(work.s.shape[0]):
+        off[0, m + j], off[1, m + j], off[2, m + j] = between(work.s[j])
+    for k in range(m):
+        mode = mode_error(x, k, between(lin[k]), c.tables, step.slot, _WORST, magnified, error[k], off)
         # The slope of the mode at the start shows such a decay: it differs by the decay's size times its rate.
         fall = 0.0
         for j in range(NODES):
             fall += DERIVATIVE[0, j] * w[k, j]
         fall = lin[k, 0] + pull[k, 0] - rates[k] * w[k, 0] - fall / h
         off[4, k] = fall / (rates[k] + 1.0 / (_EARLY * h))
+        for p in range(3):
+            off[p, k] += mode[p]
+            places[k, p + 1] += mode[p]
+    largest_one: float = _largest_voltage(form.shape, form.follow, m, off)
+    for k in range(n, m):
         for p in range(4):
-            fresh = magnified * miss[k, _WORST[p]] * missed
-            places[k, p + 1] = carried[k, p] + magnified * left[p] + fresh
-            off[p, k] = fresh
-        off[0, k] += mode_first
-        off[1, k] += mode_second
-        off[2, k] += mode_third
-        places[k, 1] += mode_first
-        places[k, 2] += mode_second
-        places[k, 3] += mode_third
-    step = _largest_voltage(shape, follow, m, off)
-    for k in range(n, w.shape[0]):
-        for p in range(4):
-            if not size[k] * abs(off[p, k]) <= step:
-                step = size[k] * abs(off[p, k])
+            if not size[k] * abs(off[p, k]) <= largest_one:
+                largest_one = size[k] * abs(off[p, k])
     for a in range(run.shape[0]):
         for p in range(N_PLACES):
             total = 0.0
             for k in range(n):
                 total += gap[a, k] * (places[k, p] + (off[4, k] if p == 0 else 0.0))
             run[a, p] = abs(total)
-    return step
+    return largest_one
 
 
 @jit
@@ -165,53 +143,12 @@ def turn_at_start(cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t
     return turned
 
 
-@jit
-def first_zero(
-    cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, h: float, theta: float, t_new: float,
-    later: bool, series: FloatArray,
-) -> tuple[int, float, float]:  # fmt: skip
-    """The area whose gap voltage is the first to leave its branch before t_new, or -1; the fraction and the time.
-
-    With `later` zeros at the start of the step are passed over.
-    """
-    which = -1
-    for a in range(cell.size):
-        if cell[a] >= 0:
-            crossing = leaves(u[a], sign[a], tol, series)
-            if crossing <= theta and t + crossing * h <= t_new and not (later and t + crossing * h <= t):
-                which, theta, t_new = a, crossing, t + crossing * h
-    return which, theta, t_new
-
-
-@jit_rows
-def account_nodes(
-    node: FloatArray, node_s: FloatArray, places: FloatArray, off: FloatArray, peaks: FloatArray
-) -> None:  # fmt: skip
-    """Largest error of any node's voltage over a step, from that of the modes and the sources (see `assess`)."""
-    m, n = places.shape[0], node.shape[1]
-    error = np.empty((N_PLACES, n))
-    for k in range(n):
-        for p in range(N_PLACES):
-            error[p, k] = places[k, p] + (off[4, k] if p == 0 else 0.0)
-    largest_one = peaks[ERROR_U]
-    for i in range(node.shape[0]):
-        for p in range(N_PLACES):
-            total = 0.0
-            for k in range(n):
-                total += node[i, k] * error[p, k]
-            if 0 < p < N_PLACES - 1:
-                for e in range(node_s.shape[1]):
-                    total += node_s[i, e] * off[p - 1, m + e]
-            largest_one = max(largest_one, abs(total))
-    peaks[ERROR_U] = largest_one
-
-
 @jit_rows
 def write_columns(
-    n: int, first_z: int, charge: bool, shape: FloatArray, follow: FloatArray, w: FloatArray, s: FloatArray,
-    y: FloatArray, values: FloatArray,
-) -> None:  # fmt: skip
+    shape: FloatArray, follow: FloatArray, w: FloatArray, s: FloatArray, y: FloatArray, charge: bool, values: FloatArray
+) -> None:
     """Write the state at all rows into the first rows of `values`; charges, if wanted, as gained since the start."""
+    n, m = shape.shape[0], w.shape[0]
     for j in range(n):
         for i in range(ROWS):
             values[j, i] = 0.0
@@ -219,10 +156,10 @@ def write_columns(
             for i in range(ROWS):
                 values[j, i] -= follow[j, e] * s[e, i]
     forms.combine(shape, w[:n], values[:n])
-    for k in range(n, first_z):
+    for k in range(n, m):
         for i in range(ROWS):
             values[k, i] = w[k, i]
-    for e in range(first_z, y.size):
+    for e in range(m, y.size):
         for i in range(ROWS):
             values[e, i] = y[e] + (values[e, i] if charge else 0.0)
 
@@ -254,16 +191,16 @@ def _leaks(
 
 
 @jit_within
-def charge_rows(
-    form: Form, work: Work, leaks: Leaks, h: float, integral: FloatArray, z: FloatArray, current: FloatArray
+def _charge_rows(
+    form: Form, work: Work, h: float, integral: FloatArray, z: FloatArray, current: FloatArray
 ) -> None:  # fmt: skip
     """Charge since the start of a step and current of each source at the nodes, into `z` and `current` (n_s, ROWS).
 
     The derivatives of the modes, and the voltages and currents of the cells, have been put into `work`.
     """
-    mobile, stored, stored_s, lost, lost_s = form.mobile, form.stored, form.stored_s, leaks.lost, leaks.lost_s
-    through, c, g, home = form.through, form.c, leaks.g, form.home
-    w, rate, s, ds = work.modes[forms.W], work.modes[forms.D], work.s, work.ds
+    stored, stored_s, lost, lost_s = form.stored, form.stored_s, form.lost, form.lost_s
+    through, c, g, home = form.through, form.c, form.g, form.home
+    w, rate, s, ds = work.modal.w, work.d, work.s, work.ds
     u, more, j, room = work.cells[forms.CELL_U], work.areas[forms.MORE], work.cells[forms.J], work.room
     n = stored.shape[1]
     collected, leak, moved = room[0], room[1], room[2]
@@ -288,7 +225,7 @@ def charge_rows(
             share = through[a, b]
             if share == 0.0:
                 continue
-            _leaks(mobile, h, c[b], g[b], u[b], more[home[b]], leak, moved)
+            _leaks(form.mobile, h, c[b], g[b], u[b], more[home[b]], leak, moved)
             for i in range(ROWS):
                 current[a, i] += share * j[b, i]
                 collected[i] += share * leak[i]
@@ -298,9 +235,8 @@ def charge_rows(
 
 @jit
 def charge_error(
-    form: Form, work: Work, h: float, lost: FloatArray, g: FloatArray, theta: float, u: FloatArray, areas: FloatArray,
-    z: FloatArray, collected: FloatArray, control: Control,
-) -> None:  # fmt: skip
+    form: Form, work: Work, h: float, theta: float, z: FloatArray, collected: FloatArray, control: Control
+) -> None:
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
 
     With du the error of a cell's voltage and dA that of its area, the error of a charge has a stored part, which goes
@@ -308,30 +244,29 @@ def charge_error(
     Interpolation errors change their sign at every node: they are stored, but over a whole step nothing of them leaks.
     If a step is cut short, the lobe between the last two nodes lasts.
 
-    `work.places` (m, N_PLACES) are the errors of the modes, and `work.off` the interpolation errors of this step among
-    them (see `error.assess`). The leaks `g` are zero within a jump. `u` (n_f, ROWS) are the cells' voltages, and `z`
-    (n_s, ROWS) the charges gained. `collected` (2, n_s) has the lasting errors so far: the sum of those with a known
-    sign, and the sum of squares of the others.
+    `places` are the errors of the modes, and `work.off` the interpolation errors of this step among them (see
+    `assess`); `z` (n_s, ROWS) are the charges gained. `collected` (2, n_s) has the lasting errors so far: the sum of
+    those with a known sign, and the sum of squares of the others.
     """
-    places, missed, cell_slips = work.places, work.off, work.cell_slips
-    lasting, brief = work.slips[0], work.slips[1]
+    places, missed, cell_slips, areas = work.modal.places, work.off, work.cell_slips, work.areas
+    lasting, brief, u, more = work.slips[0], work.slips[1], work.cells[forms.CELL_U], work.areas[forms.MORE]
     for k in range(places.shape[0]):
         for p in range(N_PLACES):
             brief[k, p] = missed[p - 1, k] if 0 < p < N_PLACES - 1 else (missed[4, k] if p == 0 else 0.0)
             lasting[k, p] = places[k, p] - (brief[k, p] if p > 0 else 0.0)
     _cell_errors(form, lasting, areas[forms.SLOPE], cell_slips[0])
     _cell_errors(form, brief, areas[forms.SLOPE], cell_slips[1])
-    off_briefly = np.empty(N_PLACES)
+    off_briefly, mobile = np.empty(N_PLACES), form.mobile
     for source in range(form.stored.shape[0]):
         first, second, third = between(z[source])
         swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
-        if not form.mobile:
+        if not mobile:
             swing, end = _area_missed(form, source, u, areas[forms.AREA])
         for p in range(1, N_PLACES - 1):
-            leak = _leak(form, source, p, lost, g, brief, cell_slips[1], u, areas[forms.MORE])
+            leak = _part(form, source, p, form.lost, form.g, True, brief, cell_slips[1], u, more)
             lobe = max(lobe, _HALF_LOBE * h * abs(leak))
         for p in range(N_PLACES):
-            held = _held(form, source, p, brief, cell_slips[1], u, areas[forms.MORE])
+            held = _part(form, source, p, form.stored, form.c, mobile, brief, cell_slips[1], u, more)
             own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
             off_briefly[p] = max(abs(held), abs(own), swing, lobe)
             apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
@@ -342,15 +277,15 @@ def charge_error(
         added, last_leak, last_theta = 0.0, 0.0, 0.0
         for p in range(N_PLACES):
             row = row_of(p)
-            leak = _leak(form, source, p, lost, g, lasting, cell_slips[0], u, areas[forms.MORE])
+            leak = _part(form, source, p, form.lost, form.g, True, lasting, cell_slips[0], u, more)
             if p > 0:
                 reached = min(POINTS[row], theta)
                 part = (reached - last_theta) / (POINTS[row] - last_theta)
-                turned = 0.0 if form.mobile else _turned(form, source, p, cell_slips[0], u, areas[forms.AREA])
+                turned = 0.0 if mobile else _turned(form, source, p, cell_slips[0], u, areas[forms.AREA])
                 added += part * (0.5 * h * (POINTS[row] - last_theta) * (leak + last_leak) + turned)
                 last_theta = POINTS[row]
             last_leak = leak
-            now = _held(form, source, p, lasting, cell_slips[0], u, areas[forms.MORE])
+            now = _part(form, source, p, form.stored, form.c, mobile, lasting, cell_slips[0], u, more)
             known = now + collected[0, source] + added
             error = math.sqrt(known * known + off_briefly[p] * off_briefly[p] + collected[1, source])
             control.error_q = max(control.error_q, error)
@@ -375,37 +310,21 @@ def _cell_errors(form: Form, places: FloatArray, slope: FloatArray, off: FloatAr
 
 
 @jit
-def _held(
-    form: Form, source: int, p: int, places: FloatArray, off: FloatArray, u: FloatArray, more: FloatArray
+def _part(
+    form: Form, source: int, p: int, by_mode: FloatArray, by_cell: FloatArray, moves: bool, places: FloatArray,
+    off: FloatArray, u: FloatArray, more: FloatArray,
 ) -> float:  # fmt: skip
-    """Stored part of a charge's error at a place, C."""
+    """Stored part of a charge's error at a place (C), or the rate (A) at which it leaks; `moves`: by the areas, too."""
     total = 0.0
     row = row_of(p)
-    for k in range(form.stored.shape[1]):
-        total += form.stored[source, k] * places[k, p]
-    for b in range(form.c.size):
+    for k in range(by_mode.shape[1]):
+        total += by_mode[source, k] * places[k, p]
+    for b in range(by_cell.size):
         a = form.home[b]
-        moved = more[a, row] * off[p, b]
-        if form.mobile:
-            moved += u[b, row] * off[p, form.c.size + a]
-        total += form.through[source, b] * form.c[b] * moved
-    return total
-
-
-@jit
-def _leak(
-    form: Form, source: int, p: int, lost: FloatArray, g: FloatArray, places: FloatArray, off: FloatArray,
-    u: FloatArray, more: FloatArray,
-) -> float:  # fmt: skip
-    """Rate at which the error at a place adds to the lasting error of a charge by leaking, A."""
-    total = 0.0
-    row = row_of(p)
-    for k in range(lost.shape[1]):
-        total += lost[source, k] * places[k, p]
-    for b in range(g.size):
-        a = form.home[b]
-        both = more[a, row] * off[p, b] + u[b, row] * off[p, g.size + a]
-        total += form.through[source, b] * g[b] * both
+        both = more[a, row] * off[p, b]
+        if moves:
+            both += u[b, row] * off[p, by_cell.size + a]
+        total += form.through[source, b] * by_cell[b] * both
     return total
 
 
@@ -434,39 +353,27 @@ def _area_missed(form: Form, source: int, u: FloatArray, area: FloatArray) -> tu
         a = form.home[b]
         first, second, third = between(area[a])
         worst = max(abs(first), abs(second), abs(third))
-        lobes = LOBE * abs(form.through[source, b]) * form.c[b] * worst * _way(u[b])
+        total = 0.0
+        for i in range(1, NODES):
+            total += abs(u[b, i] - u[b, i - 1])
+        lobes = LOBE * abs(form.through[source, b]) * form.c[b] * worst * total
         way += lobes
         end += lobes * min(1.0, worst / area[a, 0])
     return way, end
 
 
-@jit
-def _way(values: FloatArray) -> float:
-    """Total variation of values at the nodes."""
-    total = 0.0
-    for i in range(1, NODES):
-        total += abs(values[i] - values[i - 1])
-    return total
-
-
 @jit_within
 def step_charges(
-    form: Form, work: Work, leaks: Leaks, h: float, integral: FloatArray, sign: FloatArray, z: FloatArray,
-    current: FloatArray,
-) -> None:  # fmt: skip
+    form: Form, work: Work, h: float, integral: FloatArray, sign: FloatArray, z: FloatArray, current: FloatArray
+) -> None:
     """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
-    modes, cells, areas = work.modes, work.cells, work.areas
-    w, cell_u = modes[forms.W], cells[forms.CELL_U]
-    forms.mode_rates(h, leaks.rates, w, modes[forms.LIN], modes[forms.PULL], False, modes[forms.D])
-    forms.clear(cell_u)
-    forms.combine(form.tap, w[: form.shape.shape[0]], cell_u)
+    cells, w, cell_u = work.cells, work.modal.w, work.cells[forms.CELL_U]
+    forms.mode_rates(h, form.rates, w, work.lin, work.modal.pull, False, work.d)
+    forms.multiply(form.tap, w[: form.shape.shape[0]], None, cell_u)
     forms.combine(form.tap_s, work.s, cell_u)
-    cell_currents(work.own.root, cells[forms.RHO], cells[forms.J])
+    forms.multiply(work.own.root, cells[forms.RHO], None, cells[forms.J])
     if not form.mobile:
         for a in range(form.cell.size):
             if form.cell[a] >= 0 and form.slow[a] < 0:
-                forms.wanted(
-                    True, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a],
-                    areas[forms.U, a], areas[forms.AREA, a], areas[forms.SLOPE, a],
-                )  # fmt: skip
-    charge_rows(form, work, leaks, h, integral, z, current)
+                forms.wanted(form, a, True, sign[a], work.areas)
+    _charge_rows(form, work, h, integral, z, current)

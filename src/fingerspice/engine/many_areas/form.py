@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.collocation.readout import CONTROL, N_PLACES, WRITTEN_AT_ONCE
+from fingerspice.engine.collocation.readout import CONTROL, N_PLACES, Modal, new_modal
 from fingerspice.engine.many_areas import coupling as couplings
 from fingerspice.engine.network import Sources
 from fingerspice.engine.one_area import rows as stack_rows
@@ -31,8 +31,6 @@ from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, POINTS, ROW
 from fingerspice.numerics.modes import copy_to
 from fingerspice.physics.contact import inverse_area
 
-# Blocks of the modes' rows.
-W, BASE, LIN, D, PULL, USED, PULL_BEFORE, LEFT_BEFORE = range(8)
 # Blocks of the cells' rows: the parts of eta and chi that follow the sources, eta and chi, rho, shares of A', voltages,
 # currents.
 ETA_S, CHI_S, ETA, CHI, RHO, SHARE, CELL_U, J = range(8)
@@ -97,15 +95,10 @@ class Form(NamedTuple):
 REFERRED = Form._fields[1:19]
 
 
-class Leaks(NamedTuple):
-    """What leaks in a form, by the names that it has there; within a jump of the sources all of these are 0."""
-
-    rates: FloatArray
-    gain: FloatArray
-    g: FloatArray
-    pace: FloatArray
-    lost: FloatArray
-    lost_s: FloatArray
+def held(form: Form) -> Form:
+    """The form within a jump of the sources, in which nothing leaks; all else are the same arrays."""
+    leaks = "rates", "gain", "g", "pace", "lost", "lost_s"
+    return form._replace(**{name: np.zeros_like(getattr(form, name)) for name in leaks})
 
 
 class Jump(NamedTuple):
@@ -118,33 +111,27 @@ class Jump(NamedTuple):
     control: NDArray[Any]
     sign: FloatArray
     branch: FloatArray  # (n_area, 2): As `ManyAreas.branch`, by the fraction of the jump
-    leaks: Leaks  # Zeros
 
 
 class Work(NamedTuple):
     """Arrays that steps work in; those with ROWS behind hold one value for each row of a step."""
 
+    modal: Modal
     s: FloatArray
     ds: FloatArray
-    modes: FloatArray
+    # lin, d (m, ROWS): Forcing of the modes by the sources; derivatives of the modes
+    lin: FloatArray
+    d: FloatArray
     cells: FloatArray
     areas: FloatArray
     matrix: FloatArray
     mixed: FloatArray
     own: couplings.Coupling  # Of the step at hand
     at: IntArray  # (1,): Number of the reference in use
-    w0: FloatArray
-    places: FloatArray
-    weight: FloatArray
-    values: FloatArray
-    coefficients: FloatArray
-    outputs: FloatArray
     room: FloatArray
-    off: FloatArray
+    off: FloatArray  # (N_PLACES, m + n_s): Interpolation errors of the modes and the sources
     slips: FloatArray
     cell_slips: FloatArray
-    carried: FloatArray
-    spare: FloatArray
     spare_cells: FloatArray
     spare_areas: FloatArray
     # segment, now, slopes_now (n_s,): Segment of each source at hand; values and slopes at the start of the step
@@ -154,35 +141,28 @@ class Work(NamedTuple):
     here: FloatArray  # (n_area,): Areas at the start of the step
     size: FloatArray  # (m,): As that of the form, with the voltage scale behind
     gained: FloatArray  # (n_s,): Charges of a step
-    run: FloatArray  # (n_area, N_PLACES): Errors of the gaps' voltages
-    basis: FloatArray
     jump: Jump
 
 
 def new_network_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
     """Work arrays for so many live voltages, modes, cells whose area moves, areas, sources and output columns."""
     z, whole = np.zeros, np.int64
-    leaks = Leaks(z(modes), z((modes, sources)), z(cells), z(areas), z((sources, n)), z((sources, sources)))
-    jump = Jump(z(sources), z(sources), z(2, CONTROL), z(areas), z((areas, 2)), leaks)
+    jump = Jump(z(sources), z(sources), z(2, CONTROL), z(areas), z((areas, 2)))
+    own, of_areas = couplings.new_coupling(n, cells, sources), z((8, areas, ROWS))
     return Work(
-        z((sources, ROWS)), z((sources, ROWS)), z((8, modes, ROWS)), z((8, cells, ROWS)),
-        z((8, areas, ROWS)), z((cells, cells + 1, ROWS)), z((cells, areas + 1, ROWS)),
-        couplings.new_coupling(n, cells, sources), z(1, whole), z(modes), z((modes, N_PLACES)), z(modes),
-        z((columns, ROWS)), z((columns, ROWS)), z((2, WRITTEN_AT_ONCE)), z((4, ROWS)),
-        z((N_PLACES, modes + sources)), z((2, modes, N_PLACES)),
-        z((2, N_PLACES, cells + areas)), z((modes, N_PLACES - 1)), z((6, modes, ROWS)), z((8, cells, ROWS)),
-        z((8, areas, ROWS)), z(sources, whole), z(sources), z(sources), z(areas), z(modes), z(sources),
-        z((areas, N_PLACES)), z(NODES), jump,
+        new_modal(modes, columns, of_areas[U], of_areas[GUESS]), z((sources, ROWS)), z((sources, ROWS)),
+        z((modes, ROWS)), z((modes, ROWS)), z((8, cells, ROWS)), of_areas, z((cells, cells + 1, ROWS)),
+        z((cells, areas + 1, ROWS)), own, z(1, whole), z((4, ROWS)), z((N_PLACES, modes + sources)),
+        z((2, modes, N_PLACES)), z((2, N_PLACES, cells + areas)), z((8, cells, ROWS)), z((8, areas, ROWS)),
+        z(sources, whole), z(sources), z(sources), z(areas), z(modes), z(sources), jump,
     )  # fmt: skip
 
 
 @jit_within
-def leaks_of(c: Any, s: Any) -> Leaks:
-    """What leaks at present: nothing within a jump of the sources."""
-    form, none = c.form, c.work.jump.leaks
-    if s.step[0].in_jump > 0:
-        return Leaks(none.rates, none.gain, none.g, none.pace, none.lost, none.lost_s)
-    return Leaks(form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s)
+def form_of(c: Any, s: Any) -> Form:
+    """The form at present: within a jump of the sources nothing leaks."""
+    form: Form = c.held if s.step[0].in_jump > 0 else c.form
+    return form
 
 
 # From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
@@ -200,11 +180,11 @@ def combine(matrix: FloatArray, rows: FloatArray, out: FloatArray) -> None:
 
 
 @jit_rows
-def combine_from(matrix: FloatArray, rows: FloatArray, start: FloatArray, out: FloatArray) -> None:
-    """out = start + matrix @ rows, at all rows of a step."""
+def multiply(matrix: FloatArray, rows: FloatArray, start: FloatArray | None, out: FloatArray) -> None:
+    """out = matrix @ rows, more than `start` if that is given, at all rows of a step."""
     for c in range(matrix.shape[0]):
         for i in range(ROWS):
-            out[c, i] = start[c, i]
+            out[c, i] = 0.0 if start is None else start[c, i]
         for k in range(matrix.shape[1]):
             share = matrix[c, k]
             for i in range(ROWS):
@@ -258,16 +238,15 @@ def _scale_slope(factor: float, area: FloatArray, slope: FloatArray) -> None:
 
 
 @jit
-def wanted(
-    slopes_too: bool, sign: float, powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray,
-    u: FloatArray, area: FloatArray, slope: FloatArray,
-) -> None:  # fmt: skip
-    """Area at the gap voltages u (ROWS,) on the branch of a sign and, if wanted, its derivative by them."""
+def wanted(form: Form, a: int, slopes_too: bool, sign: float, areas: FloatArray) -> None:
+    """Area a at its gap voltages on the branch of a sign and, if wanted, its derivative by them."""
+    curve, lo, scale = form.curves[a], form.lo[a], form.scale[a]
+    u, area, slope = areas[U, a], areas[AREA, a], areas[SLOPE, a]
     if scale > 0.0 and _highest(sign, u) <= curve[1]:
-        polynomial_rows(powers, lo, scale, u, sign, area)
+        polynomial_rows(form.powers[a], lo, scale, u, sign, area)
         _invert(area)
         if slopes_too:
-            polynomial_rows(slopes, lo, scale, u, sign, slope)
+            polynomial_rows(form.slopes[a], lo, scale, u, sign, slope)
             _scale_slope(-scale * sign, area, slope)
     else:
         for i in range(ROWS):
@@ -298,46 +277,41 @@ def _subtract(area: FloatArray, area0: float, more: FloatArray) -> None:
 
 
 @jit_within
-def evaluate(
-    form: Form, work: Work, leaks: Leaks, several: bool, h: float, sign: FloatArray, w: FloatArray, d: FloatArray,
-    pull: FloatArray, cells: FloatArray, areas: FloatArray, least: FloatArray,
+def _evaluate(
+    c: Any, s: Any, w: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
+    least: FloatArray,
 ) -> bool:  # fmt: skip
     """Forcing of the modes by the areas, into `pull` (m, ROWS), from the modes w (m, ROWS).
 
     `d` receives the derivatives of stiff modes. `cells` and `areas` are blocks of rows, whose parts that follow the
     sources are given. False beyond a fold; under `mobile`, `least` (ROWS,) receives the distance to it.
     """
-    coupling, lin, rates, pace = work.own, work.modes[LIN], leaks.rates, leaks.pace
-    mobile = form.mobile
+    form, work, sign, h, several = form_of(c, s), c.work, c.sign, s.step[0].length, s.step[0].several > 0
+    coupling, lin, rates, mobile = work.own, work.lin, form.rates, form.mobile
     n = form.gap.shape[1]
     stiff = coupling.key[1] > 0
-    u, eta, chi, rho = areas[U], cells[ETA], cells[CHI], cells[RHO]
+    eta, rho = cells[ETA], cells[RHO]
     area, slope, rate, more = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE]
-    combine_from(form.gap, w, areas[U_S], u)
+    multiply(form.gap, w, areas[U_S], areas[U])
     clear(pull)
     if stiff:
         mode_rates(h, rates, w, lin, pull, True, d)
     for a in range(form.cell.size):
         if form.cell[a] >= 0:
-            wanted(
-                mobile, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a], u[a],
-                area[a], slope[a],
-            )  # fmt: skip
+            wanted(form, a, mobile, sign[a], areas)
             k = form.slow[a]
             if k >= 0:
                 _moving(
-                    mobile, h, rates[k], pace[a], form.unit[a], w[k], lin[k], d[k], pull[k], area[a], slope[a], rate[a]
+                    mobile, h, rates[k], form.pace[a], form.unit[a], w[k], lin[k], d[k], pull[k], area[a], slope[a],
+                    rate[a],
                 )  # fmt: skip
             _subtract(area[a], form.area0[a], more[a])
-    combine_from(coupling.from_modes, w, cells[ETA_S], eta)
+    multiply(coupling.from_modes, w, cells[ETA_S], eta)
     if stiff:
         combine(coupling.from_stiff, d[:n], eta)
     if mobile:
-        combine_from(coupling.held, w, cells[CHI_S], chi)
-        rows = couplings.Moving(u, more, slope, rate, chi, eta, rho, areas[KNOWN], cells[SHARE])
-        couplings.answer_mobile(
-            several, coupling, form.home, form.first, form.cell, rows, work.mixed, work.matrix, least
-        )  # fmt: skip
+        multiply(coupling.held, w, cells[CHI_S], cells[CHI])
+        answer_mobile(form, work, several, cells, areas, least)
         for i in range(ROWS):
             # NaN is no solution either.
             if not least[i] > 0.0:
@@ -351,30 +325,56 @@ def evaluate(
 
 
 @jit_within
-def follow_sources(form: Form, work: Work, gain: FloatArray) -> None:
-    """The parts of a step's rows that depend on the sources alone; see `evaluate`."""
-    coupling, s, ds, lin, cells, areas = work.own, work.s, work.ds, work.modes[LIN], work.cells, work.areas
+def answer_mobile(
+    form: Form, work: Work, several: bool, cells: FloatArray, areas: FloatArray, least: FloatArray
+) -> None:  # fmt: skip
+    """rho under `mobile`, with all couplings of the areas; `least` (ROWS,) takes the distance to the fold.
+
+    This is the ratio of two determinants of the capacitances for small changes: with moving areas to with areas held.
+    """
+    home, x, mixed, matrix = form.home, work.own, work.mixed, work.matrix
+    answer, more, chi, eta, known, share = x.answer, areas[MORE], cells[CHI], cells[ETA], areas[KNOWN], cells[SHARE]
+    for i in range(ROWS):
+        least[i] = 1.0
+    spare = mixed[0, more.shape[0]]
+    for a in range(form.cell.size):
+        if form.cell[a] >= 0:
+            c, last = form.first[a], form.first[a + 1]
+            u, slope, rate = areas[U, a], areas[SLOPE, a], areas[RATE, a]
+            couplings.distance_of_area(answer, x.gap, c, last, more[a], slope, chi, spare)
+            couplings.rate_of_area(answer, x.gap, x.leak[c], c, last, u, more[a], slope, rate, spare, known[a], share)
+            for i in range(ROWS):
+                least[i] *= spare[i]
+    if several:
+        couplings.fill_matrix(False, home, answer, x.cross, more, eta, known, share, mixed, matrix)
+        couplings.eliminate(matrix, spare, least, True)
+        couplings.mix(home, answer, x.cross, more, chi, mixed)
+        couplings.fill_matrix(True, home, answer, x.cross, more, eta, known, share, mixed, matrix)
+        couplings.eliminate(matrix, spare, least, False)
+        for b in range(answer.size):
+            copy_to(eta[b], matrix[b, answer.size])
+    couplings.answer_alone(home, answer, more, eta, cells[RHO])
+    couplings.add_rates(home, answer, more, chi, eta, known, share, cells[RHO])
+
+
+@jit_within
+def follow_sources(form: Form, work: Work) -> None:
+    """The parts of a step's rows that depend on the sources alone; see `_evaluate`."""
+    coupling, s, ds, lin, cells, areas = work.own, work.s, work.ds, work.lin, work.cells, work.areas
     n = form.gap.shape[1]
-    clear(lin)
-    combine(gain, s, lin)
-    clear(cells[ETA_S])
-    combine(coupling.from_rates, lin[:n], cells[ETA_S])
+    multiply(form.gain, s, None, lin)
+    multiply(coupling.from_rates, lin[:n], None, cells[ETA_S])
     combine(coupling.from_slopes, ds, cells[ETA_S])
     combine(coupling.from_sources, s, cells[ETA_S])
-    clear(cells[CHI_S])
-    combine(coupling.from_slopes, s, cells[CHI_S])
-    clear(areas[U_S])
-    combine(form.gap_s, s, areas[U_S])
+    multiply(coupling.from_slopes, s, None, cells[CHI_S])
+    multiply(form.gap_s, s, None, areas[U_S])
 
 
 @jit_within
 def evaluate_many(c: Any, s: Any) -> bool:
     """The forcing at the modes of the step at hand."""
-    work, modes, several, h = c.work, c.work.modes, s.step[0].several > 0, s.step[0].length
-    return evaluate(
-        c.form, work, leaks_of(c, s), several, h, c.sign, modes[W], modes[D], modes[PULL],
-        work.cells, work.areas, work.room[3],
-    )  # fmt: skip
+    work = c.work
+    return _evaluate(c, s, work.modal.w, work.d, work.modal.pull, work.cells, work.areas, work.room[3])
 
 
 @jit_within
@@ -384,10 +384,7 @@ def probe_many(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
     for part in (ETA_S, CHI_S, RHO):
         copy_to(cells[part], work.cells[part])
     copy_to(areas[U_S], work.areas[U_S])
-    several, h = s.step[0].several > 0, s.step[0].length
-    return evaluate(
-        c.form, work, leaks_of(c, s), several, h, c.sign, w, work.spare[5], pull, cells, areas, work.room[1]
-    )  # fmt: skip
+    return _evaluate(c, s, w, work.modal.spare[5], pull, cells, areas, work.room[1])
 
 
 @jit

@@ -11,22 +11,21 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.collocation import exponential, readout, step_control
-from fingerspice.engine.collocation.exponential import Iterates, Tables
+from fingerspice.engine.collocation.exponential import Tables
 from fingerspice.engine.collocation.readout import LoopState
 from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.many_areas import error as errors
 from fingerspice.engine.many_areas import form as forms
-from fingerspice.engine.many_areas.coupling import Moving, answer_mobile, take_coupling
+from fingerspice.engine.many_areas.coupling import take_coupling
 from fingerspice.engine.many_areas.form import Form, Work
 from fingerspice.engine.network import Sources, at_sources
+from fingerspice.engine.one_area.model import dot
 from fingerspice.engine.one_area.system import LEVEL_RATIO
 from fingerspice.numerics.lobatto import END, NODES, POINTS
-from fingerspice.numerics.modes import copy_to
+from fingerspice.numerics.modes import apply, copy_to
 from fingerspice.physics.contact import inverse_area
 
 # Ratio of an area to its reference beyond which another one is taken.
@@ -70,21 +69,6 @@ def find(references: References, form: Form, area: FloatArray) -> int:
 
 
 @jit
-def go_over(references: References, one: int, form: Form, error: FloatArray) -> None:
-    """Turn a form into that of another reference, and transform the error of the modes."""
-    n = form.shape.shape[0]
-    x = np.zeros(n)
-    for i in range(n):
-        for k in range(n):
-            x[i] += form.shape[i, k] * error[k]
-    copy_to(form.numbers, references.numbers[one])
-    for k in range(n):
-        error[k] = 0.0
-        for i in range(n):
-            error[k] += form.inverse[k, i] * x[i]
-
-
-@jit
 def start_at(area0: FloatArray, area: FloatArray) -> None:
     """Areas (n_area, ROWS) as at their references."""
     for a in range(area0.size):
@@ -96,8 +80,6 @@ def start_at(area0: FloatArray, area: FloatArray) -> None:
 _ROUNDING, _UNNOTICED = 1e-14, 1e-9
 # Number of modes times steps between two pauses, in which Python can react to Ctrl-C.
 _AT_ONCE = 40_000
-# A step that is to reach a zero of a gap voltage is this much longer, relative to the branch.
-_BEYOND = 1.02
 
 
 class ManyAreas(NamedTuple):
@@ -107,9 +89,10 @@ class ManyAreas(NamedTuple):
     network, in which nothing leaks.
     """
 
-    # form, references, tables, work: The network in modal form around a reference, whose number is in `work.at`; all
-    # references; tables of exponentials, and scratch arrays
+    # form, held, references, tables, work: The network in modal form around a reference, whose number is in `work.at`,
+    # and the same within a jump (see `form.held`); all references; tables of exponentials, and scratch arrays
     form: Form
+    held: Form
     references: References
     tables: Tables
     work: Work
@@ -145,24 +128,13 @@ def start(c: ManyAreas, s: LoopState) -> None:
     step.several = 0
     for b in range(1, form.home.size):
         step.several |= int(form.home[b] != form.home[0])
-    step.smooth = int(
-        _all_zero(form.tap_s) and _all_zero(form.stored_s) and _all_zero(form.follow) and _all_zero(form.gap_s)
-    )
+    step.smooth = int(not (form.tap_s.any() or form.stored_s.any() or form.follow.any() or form.gap_s.any()))
     for i in range(work.segment.size):
         work.segment[i] = 0
     work.areas[:] = 0.0
     start_at(form.area0, work.areas[forms.AREA])
     for k in range(work.size.size):
         work.size[k] = form.size[k] if k < n else c.u_scale
-
-
-@jit
-def _all_zero(x: FloatArray) -> bool:
-    for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
-            if x[i, j] != 0.0:
-                return False
-    return True
 
 
 @jit_within
@@ -190,11 +162,11 @@ def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
         # Step lengths after a jump are often those after the previous jump.
         control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
         step.fresh = step_control.AFTER_EDGE
-    errors.load(form.inverse, form.follow, s.y, work.now, work.w0)
+    errors.load(form.inverse, form.follow, s.y, work.now, work.modal.w0)
     _choose_branches(c, s, t)
     if step.in_jump == 0 and far_from(form, work.here) and not _take_reference(c, s):
         return readout.REFERENCE
-    rates = forms.leaks_of(c, s).rates
+    rates = forms.form_of(c, s).rates
     longest = Pace(pace.tol, 1.0, True, pace.charge) if step.in_jump > 0 else pace
     is_series = c.sources.series.shape[1] > 0 and step.in_jump == 0
     # If all rates are zero, the time constant is infinite.
@@ -267,18 +239,14 @@ def resume_time(c: ManyAreas, s: LoopState) -> None:
 def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
     """The areas at the start of a step and, where it is not known yet, the branch of each; the next zero to expect."""
     form, work, control, sign = c.form, c.work, s.control[0], c.sign
-    branch, in_jump, w0, now = branch_of(c, s), s.step[0].in_jump > 0, c.work.w0, c.work.now
+    branch, in_jump, w0, now = branch_of(c, s), s.step[0].in_jump > 0, work.modal.w0, work.now
     ahead = math.inf
     control.branch_start, control.branch_length = t, math.inf
     for a in range(sign.size):
         if form.cell[a] < 0:
             sign[a] = 1.0
             continue
-        voltage = 0.0
-        for k in range(form.gap.shape[1]):
-            voltage += form.gap[a, k] * w0[k]
-        for e in range(now.size):
-            voltage += form.gap_s[a, e] * now[e]
+        voltage = dot(form.gap[a], w0) + dot(form.gap_s[a], now)
         if sign[a] == 0.0:
             sign[a] = 1.0 if voltage >= 0.0 else -1.0
             branch[a, 0], branch[a, 1] = t, math.inf
@@ -287,7 +255,7 @@ def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
             work.here[a] = (
                 form.unit[a] * s.y[slow] if slow >= 0 else 1.0 / inverse_area(abs(voltage), form.curves[a])[0]
             )
-        end = branch[a, 0] + _BEYOND * branch[a, 1] - t
+        end = branch[a, 0] + step_control.BEYOND * branch[a, 1] - t
         if 0.0 < end < ahead:
             ahead = end
             control.branch_start, control.branch_length = branch[a, 0], branch[a, 1]
@@ -295,16 +263,18 @@ def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
 
 @jit_within
 def _take_reference(c: ManyAreas, s: LoopState) -> bool:
-    """Go over to the reference nearest to the present areas; False if it has not been made yet."""
-    form, work = c.form, c.work
+    """Go over to the reference nearest to the present areas, with the error; False if it has not been made yet."""
+    form, work, x = c.form, c.work, c.work.modal.w0
     found = find(c.references, form, work.here)
     if found < 0:
         return False
-    go_over(c.references, found, form, s.error)
+    apply(form.shape, s.error, x)
+    copy_to(form.numbers, c.references.numbers[found])
+    apply(form.inverse, x, s.error)
     work.at[0], s.step[0].tabled = found, 0.0
     copy_to(work.size[: form.shape.shape[0]], form.size)
     start_at(form.area0, work.areas[forms.AREA])
-    errors.load(form.inverse, form.follow, s.y, work.now, work.w0)
+    errors.load(form.inverse, form.follow, s.y, work.now, work.modal.w0)
     return True
 
 
@@ -317,41 +287,32 @@ _UNCONVERGED, _UNCONVERGED_SHARE = 40, 0.2
 
 
 @jit_within
-def _take_coupling(c: ManyAreas, s: LoopState) -> None:
-    """The coupling of the areas for steps of the length to be tried."""
-    form, work, leaks = c.form, c.work, forms.leaks_of(c, s)
-    which = 2 * work.at[0] + int(s.step[0].in_jump > 0)
-    take_coupling(
-        work.own, which, s.step[0].length, leaks.rates, form.feed, form.tap, form.tap_s, form.c, leaks.g, form.home,
-        form.cell,
-    )  # fmt: skip
+def _take_coupling(c: ManyAreas, s: LoopState, h: float) -> None:
+    """The coupling of the areas for steps of length h (s)."""
+    which = 2 * c.work.at[0] + int(s.step[0].in_jump > 0)
+    take_coupling(c.work.own, which, h, forms.form_of(c, s))
 
 
 @jit_within
 def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
-    form, work, step, tables, tol = c.form, c.work, s.step[0], c.tables, pace.tol
-    leaks, branch, t, in_jump = forms.leaks_of(c, s), branch_of(c, s), s.control[0].t, s.step[0].in_jump > 0
-    h = step.length
+    form, work, x, step, tol = forms.form_of(c, s), c.work, c.work.modal, s.step[0], pace.tol
+    branch, t, in_jump, h, u = branch_of(c, s), s.control[0].t, s.step[0].in_jump > 0, s.step[0].length, x.u
     if h != step.tabled:
-        exponential.take_tables(tables, -1 if in_jump else work.at[0], h, leaks.rates, work.size, s, work.weight)
-        _take_coupling(c, s)
+        exponential.take_tables(c, s, -1 if in_jump else work.at[0], h, form.rates, work.size)
+        _take_coupling(c, s, h)
         step.whole = int(work.own.key[1] == 0)
     if in_jump:
         forms.ramp_rows(t, h, work.jump.before, work.jump.after, work.s, work.ds)
     else:
         slopes = pace.charge or step.smooth == 0
         forms.source_rows(c.sources, work.segment, t, h, slopes, work.room, work.s, work.ds)
-    forms.follow_sources(form, work, leaks.gain)
-    modes, u, guess = work.modes, work.areas[forms.U], work.areas[forms.GUESS]
-    w, base, pull = modes[forms.W], modes[forms.BASE], modes[forms.PULL]
-    forms.clear(guess)
+    forms.follow_sources(form, work)
+    forms.clear(x.guess)
     forms.clear(work.cells[forms.RHO])
-    forms.free(tables.decay[step.slot], work.w0, w)
-    exponential.respond(modes[forms.LIN], tables.phi[step.slot], w, base)
-    used, pull_before, left_before = modes[forms.USED], modes[forms.PULL_BEFORE], modes[forms.LEFT_BEFORE]
-    iterates = Iterates(w, base, pull, used, pull_before, left_before, work.weight, u, guess)
-    passes, closed, answer = exponential.converge(c, s, iterates, 0.3 * tol)
+    forms.free(c.tables.decay[step.slot], x.w0, x.w)
+    exponential.respond(work.lin, c.tables.phi[step.slot], x.w, x.base)
+    passes, closed, answer = exponential.converge(c, s, 0.3 * tol)
     s.counters[readout.NFEV] += passes * NODES
     step.converged, step.step_error, step.grown = int(closed), math.inf, 1.0
     # An iteration that has not converged says nothing about the sign of the gap voltage.
@@ -362,8 +323,8 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
         return readout.RETRY
     if form.mobile:
         step.grown = 1.0 / work.room[3].min()
-    exponential.carry(c, s, iterates, form.gap, answer)
-    error = errors.assess(form, work, leaks, tables, step.slot, h, s.error, step.grown)
+    exponential.carry(c, s, form.gap, answer)
+    error = errors.assess(c, s)
     step.step_error = max(error, errors.charged(form.cell, u, work.areas[forms.AREA])) if pace.charge else error
     return readout.GO_ON
 
@@ -405,10 +366,8 @@ def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     step.t_new, step.theta, step.crossed = t + h, 1.0, -1
     if step.t_new >= stop or stop - step.t_new <= 1e-12 * h:
         step.t_new, step.theta = stop, min(1.0, (stop - t) / h)
-    u, turned_enough = work.areas[forms.U], step.flips > c.sign.size
-    step.crossed, step.theta, step.t_new = errors.first_zero(
-        c.form.cell, u, c.sign, pace.tol, t, h, step.theta, step.t_new, turned_enough, work.room[0]
-    )  # fmt: skip
+    u, turned_enough = work.modal.u, step.flips > c.sign.size
+    _cut_at_zero(c, pace, s, turned_enough)
     a = step.crossed
     if a >= 0 and step.t_new <= t:
         branch = branch_of(c, s)
@@ -424,12 +383,12 @@ def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
             return readout.AGAIN
     if c.form.mobile and step.whole == 0:
         step.grown = _magnified_whole(c, s)
-        _take_coupling(c, s)
+        _take_coupling(c, s, h)
     if not 0.0 < step.grown < math.inf:
         return readout.NO_STEP
     control.magnified = max(control.magnified, step.grown)
     step.flips = 0
-    readout.basis_at(step.theta, work.basis)
+    readout.basis_at(step.theta, work.modal.basis)
     _write(c, pace, s, t)
     _account(c, s)
     _move(c, s)
@@ -441,26 +400,29 @@ def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
 
 
 @jit_within
+def _cut_at_zero(c: ManyAreas, pace: Pace, s: LoopState, later: bool) -> None:
+    """End a step where a gap voltage first leaves its branch; if `later`, zeros at the step's start are passed over."""
+    step, u, t, series = s.step[0], c.work.modal.u, s.control[0].t, c.work.room[0]
+    for a in range(c.sign.size):
+        if c.form.cell[a] >= 0:
+            crossing = step_control.leaves(u[a], c.sign[a], pace.tol, series)
+            reached = t + crossing * step.length
+            if crossing <= step.theta and reached <= step.t_new and not (later and reached <= t):
+                step.crossed, step.theta, step.t_new = a, crossing, reached
+
+
+@jit_within
 def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
     """Inverse distance of a step to the fold with all modes, also those that the step takes for stiff.
 
     The coupling in use becomes that in which no mode is taken for stiff.
     """
-    form, work = c.form, c.work
-    own, areas, spare = work.own, work.areas, work.spare_cells
-    which = 2 * work.at[0] + int(s.step[0].in_jump > 0)
-    take_coupling(own, which, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)
-    forms.clear(spare[forms.CHI])
+    form, work, spare = c.form, c.work, c.work.spare_cells
+    _take_coupling(c, s, 0.0)
     forms.clear(spare[forms.ETA])
-    forms.combine(own.held, work.modes[forms.W][: form.shape.shape[0]], spare[forms.CHI])
-    forms.combine(own.from_slopes, work.s, spare[forms.CHI])
-    rows = Moving(
-        areas[forms.U], areas[forms.MORE], areas[forms.SLOPE], areas[forms.RATE], spare[forms.CHI],
-        spare[forms.ETA], spare[forms.RHO], work.spare_areas[forms.KNOWN], spare[forms.SHARE],
-    )  # fmt: skip
-    answer_mobile(
-        s.step[0].several > 0, own, form.home, form.first, form.cell, rows, work.mixed, work.matrix, work.room[3]
-    )  # fmt: skip
+    forms.multiply(work.own.held, work.modal.w[: form.shape.shape[0]], None, spare[forms.CHI])
+    forms.combine(work.own.from_slopes, work.s, spare[forms.CHI])
+    forms.answer_mobile(form, work, s.step[0].several > 0, spare, work.areas, work.room[3])
     least: float = work.room[3, :NODES].min()
     return 1.0 / least
 
@@ -468,54 +430,49 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
 @jit_within
 def _write(c: ManyAreas, pace: Pace, s: LoopState, t: float) -> None:
     """Charges of a step that began at t (s or, in a jump, a fraction), and its outputs."""
-    form, work, step, values = c.form, c.work, s.step[0], c.work.values
-    leaks, first_z, n_y = forms.leaks_of(c, s), s.y.size - c.s_before.size, s.y.size
+    form, work, step, values = forms.form_of(c, s), c.work, s.step[0], c.work.modal.values
+    first_z, n_y = s.y.size - c.s_before.size, s.y.size
     if pace.charge:
-        errors.step_charges(form, work, leaks, step.length, c.integral, c.sign, values[first_z:n_y], values[n_y:])
-        errors.charge_error(
-            form, work, step.length, leaks.lost, leaks.g, step.theta, work.cells[forms.CELL_U], work.areas,
-            values[first_z:], s.collected, s.control[0],
-        )  # fmt: skip
+        errors.step_charges(form, work, step.length, c.integral, c.sign, values[first_z:n_y], values[n_y:])
+        errors.charge_error(form, work, step.length, step.theta, values[first_z:n_y], s.collected, s.control[0])
     for e in range(c.s_before.size):
-        work.gained[e] = readout.at(values[first_z + e], work.basis) if pace.charge else 0.0
+        work.gained[e] = readout.at(values[first_z + e], work.modal.basis) if pace.charge else 0.0
     if s.step[0].in_jump > 0 or not readout.is_wanted(s, step.t_new):
         return
-    errors.write_columns(
-        form.shape.shape[0], first_z, pace.charge, form.shape, form.follow, work.modes[forms.W], work.s, s.y, values
-    )  # fmt: skip
-    readout.write_step(s, t, values, work.coefficients, work.outputs)
+    errors.write_columns(form.shape, form.follow, work.modal.w, work.s, s.y, pace.charge, values)
+    readout.write_step(s, t, work.modal)
 
 
 @jit_within
 def _account(c: ManyAreas, s: LoopState) -> None:
     """Peaks of a step, and the errors of the run in it."""
-    form, work, areas = c.form, c.work, c.work.areas
+    form, work, areas, x = c.form, c.work, c.work.areas, c.work.modal
     for a in range(c.sign.size):
         if form.stress[a] > 0.0:
             area_off = 0.0
             if form.slow[a] >= 0:
                 # The mode of a delayed area is the area itself.
                 for p in range(readout.N_PLACES):
-                    area_off = max(area_off, abs(work.places[form.slow[a], p]))
+                    area_off = max(area_off, abs(x.places[form.slow[a], p]))
             readout.account(
-                areas[forms.U, a], areas[forms.AREA, a], form.stress[a], s.step[0].theta, work.run[a], area_off,
-                s.peaks[a],
+                x.u[a], areas[forms.AREA, a], form.stress[a], s.step[0].theta, x.run[a], area_off, s.peaks[a]
             )  # fmt: skip
-    errors.account_nodes(form.node, form.node_s, work.places, work.off, s.peaks[c.sign.size])
+    v_error = exponential.node_error(form.node, form.node_s, x.places, work.off, x.spare[0])
+    s.peaks[-1, readout.ERROR_U] = max(s.peaks[-1, readout.ERROR_U], v_error)
 
 
 @jit_within
 def _move(c: ManyAreas, s: LoopState) -> None:
     """State and error at the end of a step, or where it is cut short."""
     form, work, theta, t_new = c.form, c.work, s.step[0].theta, s.step[0].t_new
-    w, w0, before, after = work.modes[forms.W], work.w0, work.jump.before, work.jump.after
-    readout.end_at(theta, w, work.places, work.basis, w0, s.error)
+    before, after = work.jump.before, work.jump.after
+    readout.end_at(theta, work.modal, s.error)
     if s.step[0].in_jump > 0:
         for e in range(before.size):
             c.s_before[e] = before[e] + t_new * (after[e] - before[e])
     else:
         at_sources(c.sources, work.segment, t_new, 0.0, c.s_before, work.slopes_now)
-    errors.store(form.shape, form.follow, w0, c.s_before, work.gained, s.y)
+    errors.store(form.shape, form.follow, work.modal.w0, c.s_before, work.gained, s.y)
 
 
 @jit_within

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.collocation.exponential import between
-from fingerspice.engine.collocation.readout import (
-    N_PLACES,
-    Control,
-    row_of,
-)
+from fingerspice.engine.collocation.readout import N_PLACES, Control, row_of
 from fingerspice.engine.one_area.model import Model
-from fingerspice.engine.one_area.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U, Work
-from fingerspice.engine.one_area.system import System
+from fingerspice.engine.one_area.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS, ROWS
 
 # The interpolation error of a rate changes its sign at every node, so that its integral is at most this fraction of its
@@ -29,19 +25,18 @@ _DERIVATIVE_BETWEEN = np.ascontiguousarray(BETWEEN.T @ DERIVATIVE)
 
 
 @jit_within
-def charge_step(
-    system: System, work: Work, level: int, integral: FloatArray, h: float, z0: float, theta: float,
-    control: Control, collected: FloatArray, z: FloatArray, current: FloatArray,
-) -> None:  # fmt: skip
-    """Charge z (C) and current (A) at the nodes of a step of length h (s) that starts with the charge z0.
+def charge_step(c: Any, s: Any, z: FloatArray, current: FloatArray) -> None:
+    """Charge z (C) and current (A) at the nodes of the step at hand of a stack.
 
     Both are computed through the layer that leaks slowest: the sum over all leaks would be a small difference of large
     currents. The charge that this layer stores follows from its voltages, not from the integral of w': for a fast mode
     that has decayed w' still contains its rate times the error of w, and quadrature over a step much longer than the
-    mode's time constant would turn this into charge. `work.places` holds the error of the modes (see
-    `exponential.assess`), of which the part up to fraction `theta` of the step counts.
+    mode's time constant would turn this into charge. `places` holds the error of the modes, of which the part up to
+    fraction `theta` of the step counts.
     """
-    model, r, w, pull = system.model, work.r, work.w, work.pull
+    system, work, step, control, level = c.system, c.work, s.step[0], s.control[0], s.step[0].level
+    model, r, w, pull, places = system.model, work.r, work.modal.w, work.modal.pull, work.modal.places
+    h, theta, z0 = step.length, step.theta, s.y[-1]
     rates, gain, gap, slow_share = system.rates[level], system.gain[level], system.gap[level], system.slow[level]
     n = rates.size
     slow = model.slow
@@ -75,12 +70,12 @@ def charge_step(
     missed, kept = _missed(model, slow_share, w, r, h, voltage, leak)
     for i in range(ROWS):
         z[i] = z0
-    integrate(integral, h, leak, z)
+    integrate(c.integral, h, leak, z)
     for j in range(NODES):
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control.peak_q = max(control.peak_q, abs(z[j]))
     kept = missed if theta < 1.0 else kept
-    _account(model, gap, slow_share, w, r, h, work.places, theta, missed, kept, control, collected)
+    _account(model, gap, slow_share, w, r, h, places, theta, missed, kept, control, s.collected)
 
 
 @jit

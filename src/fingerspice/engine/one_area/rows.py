@@ -9,11 +9,11 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_fused, jit_rows, jit_within
-from fingerspice.engine.collocation.readout import N_PLACES, WRITTEN_AT_ONCE
+from fingerspice.engine.collocation.readout import N_PLACES, Modal, new_modal
 from fingerspice.engine.network import term_at
 from fingerspice.engine.one_area.system import DEGREE, System
 from fingerspice.numerics import chebyshev
-from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import POINTS, ROWS
 from fingerspice.numerics.modes import copy_to
 from fingerspice.physics.contact import inverse_area
 
@@ -26,43 +26,20 @@ N_FLAT = 10
 class Work(NamedTuple):
     """Arrays that a stack's steps work in; those with ROWS behind hold one value for each row of a step."""
 
+    modal: Modal
     r: FloatArray  # (N_FLAT, ROWS): See above
-    # base, w, pull, used, pull_before, left_before (n, ROWS): The modes without and with the nonlinear term, this term
-    # at them and as it was used for them, and both of the iteration before (see `exponential.converge`)
-    base: FloatArray
-    w: FloatArray
-    pull: FloatArray
-    used: FloatArray
-    pull_before: FloatArray
-    left_before: FloatArray
-    # w0, weight (n,): The modes at the start of the step; effect of each on the gap voltage (see `exponential.weigh`)
-    w0: FloatArray
-    weight: FloatArray
-    # places, carried (n, N_PLACES) and (n, N_PLACES - 1): Errors of the modes, and those carried over from earlier
-    # steps
-    places: FloatArray
-    carried: FloatArray
-    run: FloatArray  # (N_PLACES,): Errors of the gap voltage, V
-    # values, coefficients (n + 2, ROWS): Output columns and their Chebyshev coefficients
-    values: FloatArray
-    coefficients: FloatArray
     tapped: FloatArray  # (n + 1, ROWS): Leaks that do not scale with the area
-    # Scratch; the last two as five times `w`, and as `r`
-    outputs: FloatArray
+    off: FloatArray  # (N_PLACES, n + 1): Interpolation errors of the modes and the source; see `exponential.node_error`
+    # Scratch; the last one as `r`
     sums: FloatArray
-    basis: FloatArray
-    spare: FloatArray
     spare_r: FloatArray
 
 
 def new_stack_work(n: int) -> Work:
     """Work arrays for n modes."""
-    rows, flat, columns = (n, ROWS), (N_FLAT, ROWS), (n + 2, ROWS)
-    shapes: tuple[Any, ...] = (
-        flat, rows, rows, rows, rows, rows, rows, n, n, (n, N_PLACES), (n, N_PLACES - 1), N_PLACES, columns, columns,
-        (n + 1, ROWS), (2, WRITTEN_AT_ONCE), (4, 4), NODES, (5, n, ROWS), flat,
-    )  # fmt: skip
-    return Work(*map(np.zeros, shapes))
+    r = np.zeros((N_FLAT, ROWS))
+    modal = new_modal(n, n + 2, r[U : U + 1], r[GUESS : GUESS + 1])
+    return Work(modal, r, np.zeros((n + 1, ROWS)), np.zeros((N_PLACES, n + 1)), np.zeros((3, 4)), np.zeros_like(r))
 
 
 _PI_HIGH = 3.141592653589793
@@ -234,27 +211,24 @@ def _push(push: FloatArray, q0: float, area0: float, source: FloatArray, q: Floa
 
 
 @jit_within
-def evaluate(
-    system: System, work: Work, level: int, sign: float, w: FloatArray, r: FloatArray, pull: FloatArray
-) -> bool:  # fmt: skip
+def _evaluate(c: Any, s: Any, w: FloatArray, r: FloatArray, pull: FloatArray) -> bool:
     """Gap voltage, 1/A and nonlinear term, into `r` and `pull`, from the modes w, all as in `Work`.
 
     If `system.scale` is 0 the area comes from Eq. 4, else from the polynomial or series. Under `mobile`, r[GUESS] holds
     a guess of the gap voltage; False where the area equation was not solved on the branch connected to it.
     """
+    system, level, sign, tapped = c.system, s.step[0].level, s.control[0].sign, c.work.tapped
     model = system.model
     mobile, q0 = model.mobile, system.q0[level]
     _gap_voltage(model.k_gap, system.gap[level], w, r[SOURCE], r[X_GAP], r[U])
     if mobile:
-        if not _solve_mobile(
-            model.area0, system.powers, system.slopes, system.lo, system.scale, model.curve, sign, r
-        ):  # fmt: skip
+        if not _solve_mobile(system, sign, r):
             return False
     elif system.scale > 0.0:
         polynomial_rows(system.powers, system.lo, system.scale, r[U], sign, r[Q])
     else:
         _long_area(model.curve, sign, r)
-    _pull(system.tap[level], system.tap_k, system.feed[level], q0, r[SOURCE], r[Q], w, work.tapped, pull)
+    _pull(system.tap[level], system.tap_k, system.feed[level], q0, r[SOURCE], r[Q], w, tapped, pull)
     if mobile:
         _push(system.push[level], q0, model.area0, r[SOURCE], r[Q], pull)
     return True
@@ -263,8 +237,7 @@ def evaluate(
 @jit_within
 def evaluate_one(c: Any, s: Any) -> bool:
     """The nonlinear term at the modes of the step at hand."""
-    work = c.work
-    return evaluate(c.system, work, s.step[0].level, s.control[0].sign, work.w, work.r, work.pull)
+    return _evaluate(c, s, c.work.modal.w, c.work.r, c.work.modal.pull)
 
 
 @jit_within
@@ -273,16 +246,13 @@ def probe_one(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
     work = c.work
     copy_to(work.spare_r, work.r)
     copy_to(work.spare_r[GUESS], work.r[U])
-    return evaluate(c.system, work, s.step[0].level, s.control[0].sign, w, work.spare_r, pull)
+    return _evaluate(c, s, w, work.spare_r, pull)
 
 
 @jit
-def _solve_mobile(
-    area0: float, powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray, sign: float,
-    r: FloatArray,
-) -> bool:  # fmt: skip
+def _solve_mobile(system: System, sign: float, r: FloatArray) -> bool:
     """u = k U + b q(u) at all rows at once, by Newton; r[U] holds k U + x on entry."""
-    size = 0.0
+    powers, lo, scale, area0, size = system.powers, system.lo, system.scale, system.model.area0, 0.0
     # A longer series has larger rounding errors.
     rounding = 1e-15 if powers.size == DEGREE + 1 else 2e-13
     for i in range(ROWS):
@@ -292,11 +262,11 @@ def _solve_mobile(
     for _ in range(30):
         if scale > 0.0:
             polynomial_rows(powers, lo, scale, r[U], sign, r[Q])
-            polynomial_rows(slopes, lo, scale, r[U], sign, r[DQ])
+            polynomial_rows(system.slopes, lo, scale, r[U], sign, r[DQ])
             for i in range(ROWS):
                 r[DQ, i] *= scale * sign
         else:
-            _long_area(curve, sign, r)
+            _long_area(system.model.curve, sign, r)
         worst = 0.0
         lowest = 1.0
         for i in range(ROWS):

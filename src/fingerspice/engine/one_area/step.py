@@ -16,7 +16,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.collocation import exponential, readout, step_control
-from fingerspice.engine.collocation.exponential import Iterates, Tables
+from fingerspice.engine.collocation.exponential import Tables, between, largest
 from fingerspice.engine.collocation.readout import N_PLACES, LoopState
 from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Segment, Sources, segment_at, source
@@ -25,7 +25,8 @@ from fingerspice.engine.one_area.charge import charge_step
 from fingerspice.engine.one_area.model import branch_area, dot, turns_at_zero
 from fingerspice.engine.one_area.rows import DQ, GUESS, SCRATCH, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.one_area.system import System
-from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS, SECOND, THIRD
+from fingerspice.numerics.modes import apply
 
 # A gap voltage below this fraction of the one at the next node counts as 0.
 _AT_ZERO = 1e-9
@@ -86,11 +87,7 @@ def begin(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
             return readout.NO_STEP
     step.stop = min(step.edge, t_end)
     _take_level(c, s)
-    project, w0 = c.system.project[step.level], c.work.w0
-    for k in range(w0.size):
-        w0[k] = 0.0
-        for i in range(w0.size):
-            w0[k] += project[k, i] * s.y[i]
+    apply(c.system.project[step.level], s.y, c.work.modal.w0)
     length = step.stop - step.start
     step.length = step_control.choose_step(
         pace, model.tau, model.coupled, c.sources.series.shape[1] > 0, t, length - step.since, control
@@ -101,19 +98,12 @@ def begin(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
 @jit_within
 def _enter_segment(c: OneArea, pace: Pace, s: LoopState) -> bool:
     """Take the jump of the source at the start of a segment; False if it meets a fold."""
-    step, control, model = s.step[0], s.control[0], c.system.model
+    step, control = s.step[0], s.control[0]
     # Time is counted from the edge: a transient after it may be faster than the rounding of t.
     step.since = control.t - step.start
     step.begun, step.evaluated = control.t, s.counters[readout.NFEV]
-    u_source = source_voltage(c, s, step.since)
-    if model.mobile or pace.charge:
-        if not step_control.enter(model, pace.charge, u_source, s.y, control):
-            return False
-    else:
-        control.u_gap = model.k_gap * u_source
-        for i in range(model.gap.size):
-            control.u_gap += model.gap[i] * s.y[i]
-        step_control.take_branch(1.0 if control.u_gap >= 0.0 or not model.coupled else -1.0, control)
+    if not step_control.enter(c.system.model, pace.charge, source_voltage(c, s, step.since), s.y, control):
+        return False
     # Try the step that was right after the edge before: similar jumps often need similar steps.
     control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
     step.fresh = step_control.AFTER_EDGE
@@ -139,7 +129,10 @@ def _take_level(c: OneArea, s: LoopState) -> None:
     if now == step.level:
         return
     if error[n] != now:
-        step_control.change_level(system.live, system.project, int(error[n]), now, error)
+        # The modes at the start of the step are not there yet.
+        x = c.work.modal.w0
+        apply(system.live[int(error[n])], error, x)
+        apply(system.project[now], x, error)
         error[n] = now
     step.level, s.step[0].tabled = now, 0.0
 
@@ -162,11 +155,11 @@ def _linear(
 @jit_within
 def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
-    system, work, step, control, counters = c.system, c.work, s.step[0], s.control[0], s.counters
+    system, x, step, control, counters = c.system, c.work.modal, s.step[0], s.control[0], s.counters
     model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.control[0].sign
-    h, u_rows = step.length, work.r[U]
+    h, u_rows = step.length, r[U]
     if h != step.tabled:
-        exponential.take_tables(c.tables, level, h, system.rates[level], system.gap[level], s, work.weight)
+        exponential.take_tables(c, s, level, h, system.rates[level], system.gap[level])
     rows.source_rows(
         c.sources.terms[step.index], c.sources.series[step.index], step.edge - step.start, step.since, h, pace.charge,
         r[SOURCE], r[SLOPE], r[SCRATCH:],
@@ -174,12 +167,8 @@ def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
     if model.mobile:
         for i in range(ROWS):
             r[GUESS, i] = control.u_gap
-    _linear(system.gain[level], c.tables.decay[step.slot], c.tables.phi[step.slot], work.w0, r[SOURCE], work.base)
-    iterates = Iterates(
-        work.w, work.base, work.pull, work.used, work.pull_before, work.left_before, work.weight, r[U : U + 1],
-        r[GUESS : GUESS + 1],
-    )  # fmt: skip
-    passes, closed, answer = exponential.converge(c, s, iterates, 0.3 * tol)
+    _linear(system.gain[level], c.tables.decay[step.slot], c.tables.phi[step.slot], x.w0, r[SOURCE], x.base)
+    passes, closed, answer = exponential.converge(c, s, 0.3 * tol)
     counters[readout.NFEV] += passes * NODES
     step.wrong = step_control.first_wrong(u_rows, sign, tol) if model.coupled else 0
     # Node 1 may be off its branch only because the iteration did not converge: also require a start near 0 V.
@@ -190,9 +179,7 @@ def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
             control.margin = 0.0
             return readout.NO_STEP
         return flip(s)
-    step.below = (
-        step_control.dip(u_rows, sign, tol, step.wrong, work.coefficients[0]) if model.coupled and closed else 0.0
-    )
+    step.below = step_control.dip(u_rows, sign, tol, step.wrong, x.coefficients[0]) if model.coupled and closed else 0.0
     if 0.0 < step.below < POINTS[1] and at_zero:
         # The gap voltage starts at a zero and soon returns to it: a shorter step resolves this.
         counters[readout.REJECTED] += 1
@@ -202,9 +189,52 @@ def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
         return readout.RETRY
     step.converged, step.step_error = int(closed), math.inf
     if closed:
-        exponential.carry(c, s, iterates, system.gap[level : level + 1], answer)
-        step.step_error, step.grown = exponential.assess(system, c.tables, work, step.slot, level, s.error)
+        exponential.carry(c, s, system.gap[level : level + 1], answer)
+        step.step_error, step.grown = _assess(c, s)
     return readout.GO_ON
+
+
+@jit_within
+def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
+    """Error of a converged step: interpolation error between the nodes, residual of the iteration, earlier error.
+
+    `places` takes the errors of the modes, that of the dense output included, `run` the whole error of the gap voltage.
+    Returned are the largest error of the gap voltage by this step's interpolation alone (V), which controls the step's
+    length, and the largest ratio of a move of the gap voltage to the move of a state voltage that causes it.
+    """
+    system, work, step, x, level = c.system, c.work, s.step[0], c.work.modal, s.step[0].level
+    r, off, sums, run, gain, gap = work.r, work.off, work.sums, x.run[0], system.gain[level], system.gap[level]
+    mobile, area0, places, n = system.model.mobile, system.model.area0, x.places, x.w0.size
+    off[0, n], off[1, n], off[2, n] = between(r[SOURCE])
+    # Outputs are read from the polynomial through the gap voltages at the nodes: its interpolation error counts.
+    sums[0, 0], sums[0, 1], sums[0, 2] = between(r[U])
+    for p in range(4):
+        sums[1, p] = 0.0
+        sums[2, p] = 0.0
+    for k in range(n):
+        lin = (gain[k] * off[0, n], gain[k] * off[1, n], gain[k] * off[2, n])
+        mode = exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
+        for p in range(4):
+            sums[1, p] += gap[k] * off[p, k]
+            sums[2, p] += gap[k] * places[k, p + 1]
+        for p in range(3):
+            places[k, p + 1] += mode[p]
+    worst, magnified = 0.0, 1.0
+    run[0] = 0.0
+    for p in range(4):
+        row = FIRST + p if p < 3 else END
+        factor = 1.0
+        if mobile:
+            # The modes' part of the gap voltage is multiplied by A_0 / A, and its error grows near the fold.
+            factor = area0 * r[Q, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
+            magnified = max(magnified, factor)
+        worst = max(worst, abs(factor * sums[1, p] + sums[0, p]))
+        run[p + 1] = abs(factor * sums[2, p] + sums[0, p])
+    # The charge contains the integral of A dU: the interpolation error of 1/A counts times the change of the source.
+    area_first, area_second, area_third = between(r[Q])
+    swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
+    missed = abs(largest(area_first / MISS[0], area_second / MISS[1], area_third / MISS[2]))
+    return max(worst, swing * missed / r[Q, 0]), magnified
 
 
 @jit_within
@@ -242,24 +272,24 @@ def beyond(c: OneArea, pace: Pace, s: LoopState) -> float:
 
 
 @jit
-def node_error(
-    mobile: bool, area0: float, node: FloatArray, k_node: FloatArray, gap: FloatArray, w: FloatArray, r: FloatArray,
-    places: FloatArray,
-) -> float:  # fmt: skip
-    """Largest error of any node's voltage over a step (V) from that of the modes; see `assess`.
+def _node_error(c: OneArea, level: int) -> float:
+    """Largest error of any node's voltage over a step (V) from that of the modes; see `_assess`.
 
     Under `mobile` the voltages are the modes times 1/A: their error contains that of A, and the interpolation error of
     the product.
     """
-    if not mobile:
-        return _linear_error(node, k_node, r[SOURCE], places)
+    system, r, w, places = c.system, c.work.r, c.work.modal.w, c.work.modal.places
+    node, k_node, gap, area0 = system.node[level], system.k_node, system.gap[level], system.model.area0
+    if not system.model.mobile:
+        by_source = k_node.reshape((k_node.size, 1))
+        return exponential.node_error(node, by_source, places, c.work.off, c.work.modal.spare[0])
     own, missed, values = np.zeros((places.shape[0], N_PLACES)), np.zeros(N_PLACES), np.zeros(ROWS)
     moved = np.zeros(N_PLACES)
     for p in range(N_PLACES):
         for k in range(gap.size):
             own[k, p] = area0 * r[Q, readout.row_of(p)] * places[k, p]
     for k in range(gap.size):
-        missed[1], missed[2], missed[3] = exponential.between(w[k])
+        missed[1], missed[2], missed[3] = between(w[k])
         for p in range(N_PLACES):
             own[k, p] -= area0 * r[Q, readout.row_of(p)] * missed[p]
             moved[p] += gap[k] * own[k, p]
@@ -274,31 +304,12 @@ def node_error(
                 values[j] += node[i, k] * w[k, j]
             values[j] *= area0 * r[Q, j]
             values[j] += k_node[i] * r[SOURCE, j]
-        missed[1], missed[2], missed[3] = exponential.between(values)
+        missed[1], missed[2], missed[3] = between(values)
         for p in range(N_PLACES):
             total = missed[p]
             for k in range(gap.size):
                 total += node[i, k] * (own[k, p] + moved[p] * w[k, readout.row_of(p)])
             worst = max(worst, abs(total))
-    return worst
-
-
-@jit_rows
-def _linear_error(node: FloatArray, k_node: FloatArray, source: FloatArray, places: FloatArray) -> float:
-    """Largest error of a node's voltage under `local`, where the voltages are linear in the modes and the source, V."""
-    first, second, third = exponential.between(source)
-    worst = 0.0
-    for i in range(k_node.size):
-        share = k_node[i]
-        at_start, at_first, at_second, at_third, at_end = 0.0, share * first, share * second, share * third, 0.0
-        for k in range(places.shape[0]):
-            share = node[i, k]
-            at_start += share * places[k, 0]
-            at_first += share * places[k, 1]
-            at_second += share * places[k, 2]
-            at_third += share * places[k, 3]
-            at_end += share * places[k, 4]
-        worst = max(worst, abs(at_start), abs(at_first), abs(at_second), abs(at_third), abs(at_end))
     return worst
 
 
@@ -313,7 +324,7 @@ def complete(c: OneArea, pace: Pace, s: LoopState) -> int:
         reached = length
         step.theta = min(1.0, (length - since) / h)
     if step.wrong > 0 or step.below > 0.0:
-        crossing = step_control.zero(c.work.r[U], control.sign, step.wrong, step.below, c.work.coefficients[0])
+        crossing = step_control.zero(c.work.r[U], control.sign, step.wrong, step.below, c.work.modal.coefficients[0])
         if since + crossing * h <= since:
             if step.flips < 2:
                 return flip(s)
@@ -340,53 +351,41 @@ def complete(c: OneArea, pace: Pace, s: LoopState) -> int:
 @jit_within
 def _write(c: OneArea, pace: Pace, s: LoopState, t: float) -> None:
     """Charge of a step that began at t (s), and its outputs."""
-    system, work, step, level = c.system, c.work, s.step[0], s.step[0].level
-    model, shown, values = system.model, system.shown[level], work.values
+    system, r, step, x = c.system, c.work.r, s.step[0], c.work.modal
+    model, shown, values = system.model, system.shown[step.level], x.values
     n_shown = shown.shape[0]
     if pace.charge:
-        charge_step(
-            system, work, level, c.integral, step.length, s.y[work.w0.size], step.theta, s.control[0], s.collected,
-            values[n_shown], values[n_shown + 1],
-        )  # fmt: skip
+        charge_step(c, s, values[n_shown], values[n_shown + 1])
     if not readout.is_wanted(s, step.t_new):
         return
-    readout.layers(model.mobile, model.area0, system.k_shown, shown, work.w, work.r[SOURCE], work.r[Q], values)
-    readout.write_step(s, t, values, work.coefficients, work.outputs)
+    readout.layers(model.mobile, model.area0, system.k_shown, shown, x.w, r[SOURCE], r[Q], values)
+    readout.write_step(s, t, x)
 
 
 @jit_within
 def _account(c: OneArea, s: LoopState) -> None:
     """Peaks of a step, and the errors of the run in it."""
-    system, work, step, control, level = c.system, c.work, s.step[0], s.control[0], s.step[0].level
-    model, r = system.model, c.work.r
+    model, r, step, control = c.system.model, c.work.r, s.step[0], s.control[0]
     control.magnified = max(control.magnified, step.grown)
     for i in range(ROWS):
         r[SCRATCH, i] = 1.0 / r[Q, i]
         if model.mobile and model.coupled and i < NODES and POINTS[i] <= step.theta:
             control.margin = min(control.margin, 1.0 - model.area0 * r[X_GAP, i] * r[DQ, i])
-    readout.account(r[U], r[SCRATCH], system.stress, step.theta, work.run, 0.0, s.peaks[0])
-    v_error = node_error(
-        model.mobile, model.area0, system.node[level], system.k_node, system.gap[level], work.w, r, work.places
-    )  # fmt: skip
-    s.peaks[1, readout.ERROR_U] = max(s.peaks[1, readout.ERROR_U], v_error)
+    readout.account(r[U], r[SCRATCH], c.system.stress, step.theta, c.work.modal.run[0], 0.0, s.peaks[0])
+    s.peaks[1, readout.ERROR_U] = max(s.peaks[1, readout.ERROR_U], _node_error(c, step.level))
 
 
 @jit_within
 def _move(c: OneArea, charge: bool, s: LoopState) -> None:
     """State and error at the end of a step, or where it is cut short."""
-    system, work, control, theta, y = c.system, c.work, s.control[0], s.step[0].theta, s.y
-    n, r, w, w0, places, basis, error = work.w0.size, work.r, work.w, work.w0, work.places, work.basis, s.error
-    n_shown = system.shown.shape[1]
-    readout.basis_at(theta, basis)
-    readout.end_at(theta, w, places, basis, w0, error)
+    system, r, x, control, step, y = c.system, c.work.r, c.work.modal, s.control[0], s.step[0], s.y
+    readout.basis_at(step.theta, x.basis)
+    readout.end_at(step.theta, x, s.error)
     if charge:
-        y[n], control.last_q = readout.at(work.values[n_shown], basis), readout.at(r[Q], basis)
-    control.u_gap = 0.0 if s.step[0].crossed >= 0 else readout.at(r[U], basis)
-    live = system.live[s.step[0].level]
-    for i in range(n):
-        y[i] = 0.0
-        for k in range(n):
-            y[i] += live[i, k] * w0[k]
+        y[-1] = readout.at(x.values[system.shown.shape[1]], x.basis)
+        control.last_q = readout.at(r[Q], x.basis)
+    control.u_gap = 0.0 if step.crossed >= 0 else readout.at(r[U], x.basis)
+    apply(system.live[step.level], x.w0, y)
 
 
 @jit_within
@@ -405,12 +404,10 @@ def _cross(c: OneArea, s: LoopState) -> bool:
     # The area has a kink here, which excites fast modes again: the first step is chosen as after other zeros.
     if step.below > 0.0:
         # The gap voltage returns to 0 V soon.
-        control.h = 2.0 * (step.below - step.theta) * step.length
-        control.allowed = 0.0
+        control.h, control.allowed = 2.0 * (step.below - step.theta) * step.length, 0.0
     elif control.h_after_zero > 0.0:
-        control.h = control.h_after_zero
-        control.allowed = 0.0
-    s.step[0].fresh = step_control.AFTER_ZERO
+        control.h, control.allowed = control.h_after_zero, 0.0
+    step.fresh = step_control.AFTER_ZERO
     return True
 
 
