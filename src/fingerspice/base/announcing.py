@@ -21,10 +21,8 @@ LONG = {
     ("engine.implicit.advance", "Nodal"): "implicit steps, about 15 s",
     ("engine.lockstep.march.march", ""): "scenes in lockstep, about 15 s",
 }
-_NOT_KEPT = (
-    "at every run: no folder for compiled code can be written, neither the package's nor the user's; set "
-    "NUMBA_CACHE_DIR to one that can"
-)
+_NO_FOLDER = "no folder for compiled code can be written, neither the package's nor the user's"
+_NOT_KEPT = f"at every run: {_NO_FOLDER}; set NUMBA_CACHE_DIR to one that can"
 
 
 class Bar:

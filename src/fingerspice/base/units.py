@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import math
 import re
+from typing import TypeAlias
 
 #: Types of numbers in a unit, and those units by the types' names.
-Volt = Hertz = Second = Degree = PerSecond = Ratio = float
+Volt: TypeAlias = float
+Hertz: TypeAlias = float
+Second: TypeAlias = float
+Degree: TypeAlias = float
+PerSecond: TypeAlias = float
+Ratio: TypeAlias = float
 UNITS = {"Volt": "V", "Hertz": "Hz", "Second": "s", "Degree": "deg", "PerSecond": "1/s", "Ratio": ""}
 #: Power of ten of each scale suffix; the suffix `mil` (25.4e-6) is not a power of ten.
 SCALES = {"t": 12, "g": 9, "meg": 6, "k": 3, "m": -3, "u": -6, "µ": -6, "μ": -6, "n": -9, "p": -12, "f": -15}
@@ -14,13 +20,8 @@ MIL = 25.4e-6
 
 #: Units that may follow a number without a scale. Units that begin with the letter of a scale (farad, newton, tesla
 #: ...) are not among them, because SPICE takes that letter as the scale; nor is `a`, which elsewhere means atto.
-PLAIN_UNITS = frozenset(
-    (
-        *("v", "vdc", "vac", "vpp", "volt", "volts", "h", "henry", "hz", "hertz", "o", "ohm", "ohms", "ω"),
-        *("s", "sec", "second", "seconds", "c", "w", "watt", "watts"),
-        *("deg", "degree", "degrees", "rad", "radian", "radians", "°c"),
-    )
-)
+PLAIN_UNITS = frozenset("""v vdc vac vpp volt volts h henry hz hertz o ohm ohms ω s sec second seconds c w watt watts
+    deg degree degrees rad radian radians °c""".split())  # noqa: SIM905  # fmt: skip
 
 # Words whose first letters SPICE reads as another scale than is meant, with that scale and the right one.
 _MILLI = "m (milli)"
@@ -111,9 +112,8 @@ def _power_of_ten(letters: str, text: str, as_written: str) -> int:
     if letters[0] in "ax":
         meanings = {"a": f"atto ({digits}e-18) or ampere: write {digits}", "x": f"mega: write {digits}meg"}
         raise ValueError(f"'{text}' differs between simulators: '{as_written}' may be {meanings[letters[0]]}")
-    raise ValueError(
-        f"'{as_written}' in '{text}' is neither a scale (t g meg k m mil u n p f) nor a known unit: write {digits}"
-    )
+    neither = "neither a scale (t g meg k m mil u n p f) nor a known unit"
+    raise ValueError(f"'{as_written}' in '{text}' is {neither}: write {digits}")
 
 
 def _why_not_a_number(text: str) -> str:

@@ -316,10 +316,8 @@ class Circuit(Shown):
         if not inside:
             return _unknown("parameter", path, [*self.parameters, *(e.name for e in self.by_device("V", "I"))])
         shown = ", ".join(inside if len(inside) <= 8 else [*inside[:8], "..."])
-        return (
-            f"unknown parameter {path!r}: {name} is a subcircuit, whose own parameters got their values when the deck "
-            f"was read; allowed: a parameter of an element inside it ({shown})"
-        )
+        said = f"{name} is a subcircuit, whose own parameters got their values when the deck was read"
+        return f"unknown parameter {path!r}: {said}; allowed: a parameter of an element inside it ({shown})"
 
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:

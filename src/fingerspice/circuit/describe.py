@@ -220,9 +220,8 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
 
 def require_circuit(circuit: Any) -> None:
     """Refuse anything but a circuit, and say how a circuit is made."""
-    if not isinstance(circuit, Circuit):
-        allowed = "a Circuit, such as fs.read_netlist('deck.cir') gives"
-        raise InputError(f"the circuit is a {type(circuit).__name__}; allowed: {allowed}")
+    allowed = "a Circuit, such as fs.read_netlist('deck.cir') gives"
+    require(isinstance(circuit, Circuit), "the circuit", f"a {type(circuit).__name__}", allowed)
 
 
 def area_given(area: Any) -> str | float:

@@ -30,7 +30,7 @@ from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of,
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
-from fingerspice.waveforms.waveform import Waveform, refuse
+from fingerspice.waveforms.waveform import Waveform, refuse, require
 
 # A current of a source that is this small, relative to what it is the difference of, is rounding.
 _ROUNDING = 1e-13
@@ -178,10 +178,8 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     """
     areas, carrying = find_branches(circuit)
     branches = [*carrying, *held]
-    if circuit.work == "total" and any(area.gap for area in areas):
-        raise InputError(
-            ".options work=total holds the voltage across a series stack, and this circuit is none; allowed: work=gap"
-        )
+    problem = ".options work=total holds the voltage across a series stack, and this circuit is none; allowed: work=gap"
+    refuse(circuit.work == "total" and any(area.gap for area in areas), problem)
     place = {area.node: i for i, area in enumerate(areas)}
     # The gaps come first, so that the tree contains them and their voltages are states.
     cells = sorted((cell for e in branches for cell in _cells(e, place)), key=lambda cell: cell.element.device != "GAP")
@@ -362,16 +360,13 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     Refused are names of no GAP, and networks with several sources, which have no common amplitude and frequency.
     """
     gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
-    if finger is not None and finger.lower() not in gaps:
-        known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
-        raise InputError(f"finger is {finger!r}; allowed: the name of a GAP, {known}")
+    known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
+    require(finger is None or finger.lower() in gaps, "finger", repr(finger), f"the name of a GAP, {known}")
     network = network_of(circuit)
     refuse(not gaps, "a phasor solution needs a GAP; this circuit has none")
-    if len(network.sources) != 1:
-        names = ", ".join(e.name for e in network.sources)
-        raise InputError(f"a phasor solution needs one source, whose amplitude it takes; this circuit has {names}")
-    if finger is None and len(gaps) > 1:
-        raise InputError(f"this circuit has several GAPs; allowed: finger= one of {', '.join(gaps.values())}")
+    names, problem = ", ".join(e.name for e in network.sources), "a phasor solution needs one source"
+    refuse(len(network.sources) != 1, f"{problem}, whose amplitude it takes; this circuit has {names}")
+    refuse(finger is None and len(gaps) > 1, f"this circuit has several GAPs; allowed: finger= one of {known}")
     name = next(iter(gaps.values())) if finger is None else gaps[finger.lower()]
     # Every GAP drives an area: `find_branches` refuses two on one.
     place = next(i for i, area in enumerate(network.areas) if area.gap is not None and area.gap.name == name)

@@ -29,7 +29,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element, T
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, SKIN_LADDER, skin_permittivity, skin_resistivity
-from fingerspice.waveforms.waveform import DC, Product, Sum, Waveform
+from fingerspice.waveforms.waveform import DC, Product, Sum, Waveform, refuse
 
 #: Largest number of elements of a circuit, because every matrix of a network is dense.
 MAX_ELEMENTS = 2000
@@ -57,17 +57,14 @@ class Area(NamedTuple):
 def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
     """Areas of a circuit, and the elements that carry current; a circuit that has no solution is refused."""
     count = count_of(circuit)
-    if count > MAX_ELEMENTS:
-        counted = f", a SKIN_DISPERSIVE counted as its {SLABS} slabs" if count > len(circuit.elements) else ""
-        raise InputError(f"the circuit has {count:,} elements{counted}; allowed: at most {MAX_ELEMENTS:,}")
+    counted = f", a SKIN_DISPERSIVE counted as its {SLABS} slabs" if count > len(circuit.elements) else ""
+    refuse(count > MAX_ELEMENTS, f"the circuit has {count:,} elements{counted}; allowed: at most {MAX_ELEMENTS:,}")
     areas, drives = _areas(circuit), {e.name for e in driving(circuit)}
     branches = [e for e in circuit.elements if e.device not in "VI" or e.name in drives]
     if not drives:
-        if not circuit.initial and all(e.initial is None for e in branches):
-            raise InputError(
-                "the circuit has no source; allowed: a V element that drives the stack, such as V1 drive 0 "
-                "SIN(0 200 100), or a start, IC= of a capacitor or .ic v(node)="
-            )
+        allowed = "a V element that drives the stack, such as V1 drive 0 SIN(0 200 100), or a start, IC= of a capacitor"
+        still = not circuit.initial and all(e.initial is None for e in branches)
+        refuse(still, f"the circuit has no source; allowed: {allowed} or .ic v(node)=")
         # In place of a source, one of 0 A.
         nodes, names = branches[0].nodes[1::-1], branches[0].node_names[1::-1]
         branches.append(Element("none", "I", nodes, names, MappingProxyType({}), DC(0.0)))
@@ -248,8 +245,7 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
 
     at = _incidence(branches)
     for e in branches:
-        if e.nodes[0] == e.nodes[1]:
-            raise InputError(f"{e.name} has both ends on node {e.node_names[0]!r}", e.where)
+        refuse(e.nodes[0] == e.nodes[1], f"{e.name} has both ends on node {e.node_names[0]!r}", e)
     # Ground comes last: a chain not connected to ground also has a free end elsewhere, which is the node to name.
     for node, (e, *others) in sorted(at.items(), key=lambda item: item[0] == "0"):
         if not others:
@@ -259,8 +255,7 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
             hint = "; ground is 0 or gnd" if node.startswith(_GROUNDS) else hint
             alone = f"node {named(node, e)} is floating: only {e.name} touches it"
             raise InputError(f"{alone}; allowed: two or more elements at every node{hint}", e.where)
-    if "0" not in at:
-        raise InputError("no element touches ground; allowed: one node must be 0 (or gnd)")
+    refuse("0" not in at, "no element touches ground; allowed: one node must be 0 (or gnd)")
     reached = _ways(branches, "0")
     for node, (e, *_) in at.items():
         if node not in reached:
@@ -274,8 +269,7 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
         while (step := came[node]) is not None:
             names.append(step.name)
             node = step.nodes[0] if step.nodes[1] == node else step.nodes[1]
-        if len(names) == 1:
-            raise InputError(f"{names[0]} and {e.name} are voltage sources in parallel", e.where)
+        refuse(len(names) == 1, f"{names[0]} and {e.name} are voltage sources in parallel", e)
         raise InputError(f"{e.name} closes a loop of voltage sources with {', '.join(names)}", e.where)
     reached = _ways([e for e in branches if e.device != "I"], "0")
     for source, node in ((e, node) for e in branches if e.device == "I" for node in e.nodes[:2]):

@@ -26,7 +26,7 @@ from fingerspice.circuit.devices import FIRST_OF_SOURCES, MEANINGS, ParameterSpe
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import SLABS, count_of, driving_sources
 from fingerspice.netlist.netlist import source_from_text
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 #: A slider goes from the deck's value over this to its value times this, within the usual range.
 _SPAN = 100.0
@@ -155,9 +155,8 @@ def read_source(
     names = {e.name.lower(): e.name for e in driving_sources(circuit)}
     given, said = _NAMED.fullmatch(text).groups()  # type: ignore[union-attr]
     given = given or next(iter(names), "")
-    if given.lower() not in names:
-        known = ", ".join(names.values()) or "none, as it has no source"
-        raise InputError(f"{given or text!r} is not a source of the circuit; allowed: {known}")
+    known = ", ".join(names.values()) or "none, as it has no source"
+    refuse(given.lower() not in names, f"{given or text!r} is not a source of the circuit; allowed: {known}")
     name, recorded = names[given.lower()], _RECORDED.fullmatch(said)
     if recorded is None:
         with quiet():
@@ -341,11 +340,9 @@ class Asked:
         base = own if own is not None and self.deck == own.text else _parsed(self.deck)
         if self.skin == "dispersive":
             base = base.remember("dispersive", partial(_dispersive, base))
-        if base is not own and count_of(base) > MOST_ELEMENTS:
-            raise InputError(
-                f"the deck has {count_of(base):,} elements, a dispersive skin counted as its {SLABS} slabs; allowed: "
-                f"at most {MOST_ELEMENTS} on this page"
-            )
+        count = f"{count_of(base):,} elements, a dispersive skin counted as its {SLABS} slabs"
+        few = base is own or count_of(base) <= MOST_ELEMENTS
+        refuse(not few, f"the deck has {count}; allowed: at most {MOST_ELEMENTS} on this page")
         circuit = base
         if self.source.strip():
             name, waveform, self.gain = read_source(self.source, circuit, self.recording)
@@ -398,10 +395,8 @@ class Asked:
         if 2.0 * points >= wanted:
             return points, ""
         many = f"{count:,.0f} oscillations" if _OF_OSCILLATION * count >= _OF_PIECE * edges else f"{edges:,.0f} samples"
-        return points, (
-            f"the curves have {points:,} points for {many} of the source, too few for their shape; the figures in the "
-            "table do not suffer; fewer periods, or only the last one, show more"
-        )
+        few = f"the curves have {points:,} points for {many} of the source, too few for their shape; the figures in the"
+        return points, f"{few} table do not suffer; fewer periods, or only the last one, show more"
 
 
 @lru_cache(maxsize=32)

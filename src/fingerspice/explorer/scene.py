@@ -101,11 +101,8 @@ def deadline() -> Callable[[float], None]:
     def check(done: float) -> None:
         nonlocal begin
         begin = min(begin, now := time.monotonic())
-        if now - begin > LONGEST_RUN:
-            raise InputError(
-                f"the run was stopped after {LONGEST_RUN:g} s at {100.0 * done:.3g} % of its length; allowed: fewer "
-                "periods, or a larger error"
-            )
+        problem = f"the run was stopped after {LONGEST_RUN:g} s at {100.0 * done:.3g} % of its length"
+        refuse(now - begin > LONGEST_RUN, f"{problem}; allowed: fewer periods, or a larger error")
 
     return check
 
@@ -447,9 +444,8 @@ def scenes() -> Iterator[Entry]:
 def _run_scene(example: Example) -> fs.Solution:
     asked = Asked({"deck": example.deck, **example.asked})
     first, stop, _ = asked.times
-    return fs.simulate(
-        asked.circuit, t_stop=stop, t_eval=np.linspace(first, stop, 4001), charge_law=asked.charge_law, throw=False
-    )
+    t = np.linspace(first, stop, 4001)
+    return fs.simulate(asked.circuit, t_stop=stop, t_eval=t, charge_law=asked.charge_law, throw=False)
 
 
 def draw(entry: Entry, picture: Path) -> None:

@@ -107,9 +107,8 @@ class Explorer:
         if not self.framed:
             return None
         style = f"width: 100%; height: {FRAME_HEIGHT}px; border: 1px solid #CCCCCC;"
-        return (
-            f'<iframe src="{self.url}" title="fingerspice explorer" style="{style}" allow="clipboard-write"></iframe>'
-        )
+        shown = f'src="{self.url}" title="fingerspice explorer" style="{style}"'
+        return f'<iframe {shown} allow="clipboard-write"></iframe>'
 
     def open(self) -> None:
         """Open the page in the browser."""

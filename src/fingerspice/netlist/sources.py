@@ -171,9 +171,7 @@ SOURCES: Mapping[str, Function] = {
     "triangle": Function(_plain(Triangle), "amplitude frequency", 2),
     "sawtooth": Function(_plain(Sawtooth), "amplitude frequency", 2),
     "chirp": Function(_plain(Chirp), "amplitude f0 f1 duration", 4),
-    "am": Function(
-        _plain(AM), "amplitude carrier envelope depth", 3, refused=f"AM {_CHANGED}, or give it by --source",
-    ),
+    "am": Function(_plain(AM), "amplitude carrier envelope depth", 3, refused=f"AM {_CHANGED}, or give it by --source"),
     "burst": Function(_burst, "amplitude frequency cycles every", 3),
     "wavefile": Function(
         _wavefile, "path gain channel", keys="gain channel upsample",
