@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -118,12 +118,10 @@ class Scene:
     def shown(self) -> Scene:
         """The scene in whose form exponential steps record a stack: a voltage for each layer, not for each cell."""
         # Not cached where it is this one: an object that holds itself is freed by garbage collection only.
-        return self if self.stack is None or self.stack.by_layer is self.stack else self._of_whole_layers
-
-    @cached_property
-    def _of_whole_layers(self) -> Scene:
-        assert self.stack is not None
-        return replace(self, network=loop_network(self.stack.by_layer), prepared={})
+        if self.stack is None or (whole := self.stack.by_layer) is self.stack:
+            return self
+        made = partial(replace, self, network=loop_network(whole), prepared={})
+        return kept_with(self.prepared, ("shown",), 1, made)
 
     @cached_property
     def area0(self) -> FloatArray:
