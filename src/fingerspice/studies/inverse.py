@@ -161,11 +161,8 @@ def _linear_inverse(net: Network) -> Callable[[FloatArray, float], FloatArray]:
     @lru_cache(maxsize=1)
     def response(m: int, h: float) -> ComplexArray:
         s = _DAMPING / (m * h) + 2j * np.pi * np.arange(m // 2 + 1) / (m * h)
-        y = leak + s[:, None] * c
-        kernel = net.k + np.einsum("ci,fc,cj->fij", net.p, y, net.p, optimize=True)
-        right = net.b[:, 0] + np.einsum("ci,fc,c->fi", net.p, y, net.q[:, 0], optimize=True)
-        x = np.linalg.solve(kernel, -right[:, :, None])[:, :, 0]
-        gain = x @ net.p[gap] + net.q[gap, 0]
+        k, b = net.stiffness(leak + s[:, None] * c)
+        gain = np.linalg.solve(k, -b)[..., 0] @ net.p[gap] + net.q[gap, 0]
         if not np.all(np.abs(gain) > _DEAF * np.abs(gain).max(initial=0.0)):
             deaf = f"{net.sources[0].name} does not drive the gap at every frequency of the drive"
             raise InputError(f"{deaf}; allowed: a source with a path to the GAP, and a lower rate")
