@@ -32,7 +32,7 @@ from fingerspice.solve.planning import asked
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block, driving, ready
 from fingerspice.waveforms.samples import Samples, as_samples
-from fingerspice.waveforms.waveform import DC, Sum, Waveform
+from fingerspice.waveforms.waveform import DC, Sum, Waveform, refuse
 
 # Error asked of the runs that are compared, over the run's own, and the least one; and what may be left of it where
 # rounding is in the way, over the run's own.
@@ -171,12 +171,10 @@ def sensitivities_of(
 def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """The number's derivatives by u_gap, force and area at the outputs, shape (n_t,), and by the latter's means."""
     allowed = ", ".join((*SIGNALS, *MEANS))
-    if not of:
-        raise InputError(f"no signal is given; allowed: {allowed}")
+    refuse(not of, f"no signal is given; allowed: {allowed}")
     by: dict[str, Any] = dict.fromkeys(SIGNALS, np.zeros(run.t.size)) | dict.fromkeys(MEANS, 0.0)
     for name, given in of.items():
-        if name not in by:
-            raise InputError(f"unknown signal {name!r}; allowed: {allowed}")
+        refuse(name not in by, f"unknown signal {name!r}; allowed: {allowed}")
         value = real_numbers(name, given, "numbers, derivatives by the signal")
         shape, finite = () if name in MEANS else run.t.shape, bool(np.isfinite(value).all())
         if value.shape != shape or not finite:
@@ -346,8 +344,7 @@ def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradien
     if run.stored is not None or run.start == "given":
         allowed = "a run just made from its circuit's own start"
         raise InputError(f"{_ASKED}the run goes on from another one or was read from a file; allowed: {allowed}")
-    if run.failure is not None:
-        raise InputError(f"{_ASKED}the run failed; allowed: a run to its end")
+    refuse(run.failure is not None, f"{_ASKED}the run failed; allowed: a run to its end")
     one = _Intervals(run)
     coarse, fine = one.swept(_weights(run, of))
     largest = float(np.abs(fine).max())

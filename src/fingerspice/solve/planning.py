@@ -25,7 +25,7 @@ from fingerspice.solve.runs import Run
 from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.sampling import Function
-from fingerspice.waveforms.waveform import DOUBLE, require
+from fingerspice.waveforms.waveform import DOUBLE, refuse, require
 
 # Number of plans cached with a scene.
 MOST_PLANS = 16
@@ -58,8 +58,7 @@ def asked(circuit: Circuit, *, rtol: float, t_eval: FloatArray | None = None, **
 
 def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "auto") -> Plan:
     """The model for a problem with this error and tier asked for; a method that is named steps the coupled one."""
-    if tier not in ("auto", *TIERS):
-        raise InputError(f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
+    refuse(tier not in ("auto", *TIERS), f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
     asked = "coupled" if tier == "auto" and method != "auto" else tier
     key = ("plan", rtol, asked, problem.start, problem.charge, _stores(problem), problem.t_start, problem.t_stop)
     return kept_with(problem.scene.prepared, key, MOST_PLANS, lambda: _plan(problem, rtol, asked))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -118,12 +118,10 @@ class Scene:
     def shown(self) -> Scene:
         """The scene in whose form exponential steps record a stack: a voltage for each layer, not for each cell."""
         # Not cached where it is this one: an object that holds itself is freed by garbage collection only.
-        return self if self.stack is None or self.stack.by_layer is self.stack else self._of_whole_layers
-
-    @cached_property
-    def _of_whole_layers(self) -> Scene:
-        assert self.stack is not None
-        return replace(self, network=loop_network(self.stack.by_layer), prepared={})
+        if self.stack is None or (whole := self.stack.by_layer) is self.stack:
+            return self
+        made = partial(replace, self, network=loop_network(whole), prepared={})
+        return kept_with(self.prepared, ("shown",), 1, made)
 
     @cached_property
     def area0(self) -> FloatArray:
@@ -240,23 +238,21 @@ def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
     else:
         assert stack.contact is not None
         area0, curve = stack.contact.area_at_rest, stack.contact.curve(u_top)
-        before: Model | None = stack.kept.get(("model", law))
-        if before is not None:
-            return before._replace(curve=curve)
-    order, n = list(stack.state_order), stack.c.size - 1
-    probe = int(np.argmin(stack.c)) if stack.gap is None else stack.gap
-    k, leaks = stack.k[order], stack.leak_rates(area0)
-    slow = int(np.argmin(leaks))
-    rates, _, _, _ = modes(leaks[order], k)
-    fastest = float(rates.max(initial=0.0))
-    # Weights of the states in each cell's voltage beyond its share k U.
-    of_probe, of_slow = np.vstack([np.eye(n), np.full(n, -1.0)])[[order.index(probe), order.index(slow)]]
-    model = Model(
-        mobile=law == "mobile", coupled=fixed is None, k=k, rate=(stack.g_area / stack.c)[order],
-        rate0=(stack.g_total / stack.c)[order], k_gap=float(stack.k[probe]), gap=of_probe, s=stack.s,
-        slow=np.append(of_slow, [stack.k[slow], stack.c[slow], stack.g_area[slow], stack.g_total[slow]]),
-        area0=area0, tau=1.0 / fastest if fastest > 0.0 else math.inf, curve=curve,
-    )  # fmt: skip
-    if fixed is None:
-        stack.kept["model", law] = model
-    return model
+
+    def make() -> Model:
+        order, n = list(stack.state_order), stack.c.size - 1
+        probe = int(np.argmin(stack.c)) if stack.gap is None else stack.gap
+        k, leaks = stack.k[order], stack.leak_rates(area0)
+        slow = int(np.argmin(leaks))
+        rates, _, _, _ = modes(leaks[order], k)
+        fastest = float(rates.max(initial=0.0))
+        # Weights of the states in each cell's voltage beyond its share k U.
+        of_probe, of_slow = np.vstack([np.eye(n), np.full(n, -1.0)])[[order.index(probe), order.index(slow)]]
+        return Model(
+            mobile=law == "mobile", coupled=fixed is None, k=k, rate=(stack.g_area / stack.c)[order],
+            rate0=(stack.g_total / stack.c)[order], k_gap=float(stack.k[probe]), gap=of_probe, s=stack.s,
+            slow=np.append(of_slow, [stack.k[slow], stack.c[slow], stack.g_area[slow], stack.g_total[slow]]),
+            area0=area0, tau=1.0 / fastest if fastest > 0.0 else math.inf, curve=curve,
+        )  # fmt: skip
+
+    return kept_with(stack.kept, ("model", law, fixed), 2, make)._replace(curve=curve)

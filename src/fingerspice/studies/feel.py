@@ -20,7 +20,7 @@ from fingerspice.plots.traces import stems
 from fingerspice.results.record import Sealed
 from fingerspice.results.solution import Solution
 from fingerspice.results.spectrum import Spectrum
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 #: Standard gravity, m/s^2.
 GRAVITY = 9.80665
@@ -374,8 +374,7 @@ def feel(
     require(isinstance(mechanics, SkinMechanics), "mechanics", repr(mechanics), "a SkinMechanics")
     table = android_threshold() if threshold is None else threshold
     require(isinstance(table, Threshold), "threshold", repr(table), "a Threshold")
-    if not solution.gaps:
-        raise InputError("the circuit has no GAP, so there is no friction to feel; allowed: a circuit with a GAP")
+    refuse(not solution.gaps, "the circuit has no GAP, so there is no friction to feel; allowed: a circuit with a GAP")
     spectrum = solution.spectrum(signal)
     end = math.inf if spectrum.amplitude is None else spectrum.frequency[-1]
     if end < max(table.frequency[-1], 0.1 * FASTEST_FELT):

@@ -30,7 +30,7 @@ from fingerspice.solve.simulation import simulate
 from fingerspice.waveforms.files import read_text_columns
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import Waveform, as_waveform, require
+from fingerspice.waveforms.waveform import Waveform, as_waveform, refuse, require
 
 #: Types that may be given as a wanted force.
 Wanted = ArrayLike | Waveform | Callable[[float], float]
@@ -67,8 +67,7 @@ class Finger:
                 raise InputError(f"an inverse drive is that of {what} {names}; allowed: {allowed}")
         (self.gap,), (self.source,) = gaps, sources
         tau = self.gap.values["tau"]
-        if tau > 0.0:
-            raise InputError(f"{self.gap.name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
+        refuse(tau > 0.0, f"{self.gap.name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
         scene = linear_scene(circuit)
         self.network, self.contact, stack = scene.network, scene.contact, scene.network.stack
         self.area = scene.network.areas[scene.finger].given  # Fixed by the deck, m^2, or None
@@ -162,11 +161,8 @@ def _linear_inverse(net: Network) -> Callable[[FloatArray, float], FloatArray]:
     @lru_cache(maxsize=1)
     def response(m: int, h: float) -> ComplexArray:
         s = _DAMPING / (m * h) + 2j * np.pi * np.arange(m // 2 + 1) / (m * h)
-        y = leak + s[:, None] * c
-        kernel = net.k + np.einsum("ci,fc,cj->fij", net.p, y, net.p, optimize=True)
-        right = net.b[:, 0] + np.einsum("ci,fc,c->fi", net.p, y, net.q[:, 0], optimize=True)
-        x = np.linalg.solve(kernel, -right[:, :, None])[:, :, 0]
-        gain = x @ net.p[gap] + net.q[gap, 0]
+        k, b = net.stiffness(leak + s[:, None] * c)
+        gain = np.linalg.solve(k, -b)[..., 0] @ net.p[gap] + net.q[gap, 0]
         if not np.all(np.abs(gain) > _DEAF * np.abs(gain).max(initial=0.0)):
             deaf = f"{net.sources[0].name} does not drive the gap at every frequency of the drive"
             raise InputError(f"{deaf}; allowed: a source with a path to the GAP, and a lower rate")
@@ -381,20 +377,17 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Wavef
     `rate` (Hz) is given: ``time (ms), friction (N)``. Time 0 of the course is the first of the table's times.
     """
     found = read_text_columns(path)
-    if not found.names:
-        raise InputError(f"'{path}' has no header; allowed: a first line such as 'time (s), friction (N)'")
+    refuse(not found.names, f"'{path}' has no header; allowed: a first line such as 'time (s), friction (N)'")
     kinds = [name.lower() for name in found.names]
     named = [kind for kind in ("force", "friction") if kind in kinds]
     if len(named) != 1:
         has = "columns force and friction" if named else "no column named force or friction"
         raise InputError(f"'{path}' has {has}; it has {found.listed()}; allowed: one column of these names")
     values = found.scaled(kinds.index(named[0]), "N")
-    if values.size < 2:
-        raise InputError(f"'{path}' has one row; allowed: two or more")
+    refuse(values.size < 2, f"'{path}' has one row; allowed: two or more")
     timed = next((i for i, name in enumerate(kinds) if name in ("t", "time")), None)
     if timed is None:
-        if rate is None:
-            raise InputError(f"'{path}' has no column of times and no rate; allowed: a column time, or a rate in Hz")
+        refuse(rate is None, f"'{path}' has no column of times and no rate; allowed: a column time, or a rate in Hz")
         return named[0], *_wave_of(values, named[0], rate, None)
     t = found.scaled(timed, "s")
     back = np.flatnonzero(np.diff(t) <= 0.0)
@@ -480,8 +473,7 @@ def inverse_drive(
             allowed = f"at most a {FEWEST}th of it, {rate / FEWEST:g} Hz, or a higher rate"
             raise InputError(f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: {allowed}")
         rate = rate or PER_PERIOD * carrier
-        if end * carrier < 1.0:
-            raise InputError(f"{end:g} s hold no period of the carrier; allowed: 1 or more")
+        refuse(end * carrier < 1.0, f"{end:g} s hold no period of the carrier; allowed: 1 or more")
     rate = rate or (wave.rate if isinstance(wave, Samples) else RATE)
     count, allowed = end * rate, f"2 to {MOST_SAMPLES:,} samples"
     require(1.0 <= count <= MOST_SAMPLES - 1, "the drive", f"{count:,.0f} samples long", allowed)
@@ -507,9 +499,8 @@ class Task:
         contact, force, least, scale, rest = finger.contact, wave.value(t), "0 N", 1.0, 0.0
         if kind == "friction":
             scale, rest = contact.mu, contact.f_n
-            if scale == 0.0:
-                said = "the GAP has mu=0, so that no voltage makes friction"
-                raise InputError(f"{said}; allowed: mu > 0, or a wanted force")
+            allowed = "mu > 0, or a wanted force"
+            refuse(scale == 0.0, f"the GAP has mu=0, so that no voltage makes friction; allowed: {allowed}")
             # F_el = F_T / mu - F_N (Eq. 1 with full slip).
             force, least = force / scale - rest, f"{scale * rest:g} N, the friction without a voltage"
         bad = np.flatnonzero(~(force >= -1e-12 * max(1.0, float(np.abs(force).max()))))

@@ -27,7 +27,7 @@ from fingerspice.solve.runs import Progress
 from fingerspice.solve.simulation import run_problem
 from fingerspice.studies.inverse import Finger, Task, on_carrier
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import Product, as_waveform, require
+from fingerspice.waveforms.waveform import Product, as_waveform, refuse, require
 
 # Samples per period of the modulation and of the carrier, and the lowest sample rate, Hz; duration of a force in
 # periods of the modulation, and the least, s.
@@ -174,8 +174,7 @@ def capability(
         raise InputError(f"frequency reaches {f.max():g} Hz; allowed: {allowed}")
     finger = Finger(circuit, charge_law)
     mu = finger.contact.mu
-    if mu == 0.0:
-        raise InputError(f"{finger.gap.name} has mu=0 and no friction; allowed: mu > 0")
+    refuse(mu == 0.0, f"{finger.gap.name} has mu=0 and no friction; allowed: mu > 0")
     # The charges in the layers can raise the gap voltage above the source voltage, but not to ten times the limit.
     most = 0.4 * float(finger.force(10.0 * limit))
     search = _Search(finger, limit, carrier, most)
