@@ -237,8 +237,6 @@ def area_given(area: Any) -> str | float:
 # Largest relative difference of frequencies that are the same, and smallest one of the mean force that is given as a
 # number; and the words by which a warning about a SKIN begins.
 _SAME, _LITTLE, _TAKES = 1e-9, 0.005, "takes its data at f ="
-# Directives that only ngspice needs, so that no warning is given about them.
-_FOR_NGSPICE = (".nodeset", ".options")
 # Smallest number of points that make a PWL a recording, which is meant to be run to its end and not to be a step in a
 # longer run; and the smallest fraction of a run that a recording fills without a warning.
 _RECORDED, _FILLED = 100, 0.01
@@ -269,8 +267,8 @@ def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
 
 
 def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
-    """Warnings about directives without effect."""
-    return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(_FOR_NGSPICE))
+    """Warnings about directives without effect, but for those of ngspice's options."""
+    return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(".options"))
 
 
 def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) -> Iterator[str]:
