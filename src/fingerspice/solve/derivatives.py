@@ -42,7 +42,7 @@ _SHARE, _FINEST, _KNOWN = 1e-3, 3e-13, 1e-2
 _STEP, _CLOSER = 5e-4, (0.03, 1e-3)
 # Steps between two samples: of the first two numbers, or below this `rtol` of the second and third, and twice as many
 # while these differ; and the error wanted, relative to the largest derivative, over `rtol`.
-_STEPS, _COARSE, _ALLOWED = (1, 2, 4, 8, 16, 32, 64), 1e-7, 10.0
+_STEPS, _COARSE, _ALLOWED = (1, 2, 4, 8, 16, 32, 64, 128), 1e-7, 10.0
 # Distance of the differences, over the largest voltage.
 _APART = 1e-5
 # Intervals whose derivatives are held at once.
@@ -242,9 +242,9 @@ class _Intervals:
     def slopes(self, at: IntArray, rows: BoolArray) -> list[FloatArray]:
         """Derivatives (`_slopes`) of what the intervals `at` lead to, of which `rows` says which are wanted.
 
-        They come twice: as of the shortest steps, and extrapolated.
+        They come twice: as of steps twice as long as the shortest ones, and extrapolated from these.
         """
-        m, many, allowed, to = self.m, self.h.size > 1, _ALLOWED * self.run.rtol, self.x[at + 1]
+        m, many, allowed, to = self.m, self.h.size > 1, self.run.rtol, self.x[at + 1]
         length = self.h[at] if many else self.h
         coarse, fine = (self._slopes(at, to, length, parts) for parts in self.parts[:2])
         # By the modes for what moves them, and by the source relative to the largest one.
@@ -260,8 +260,9 @@ class _Intervals:
             fine[..., still] = self._slopes(at[still], to[still], length[still] if many else length, parts)
             off = np.abs(fine[..., still] - coarse[..., still]) > allowed * scale[..., None]
             wanted[..., still] = rows[:, None, None] & off
-        # Steps are of third order where the source is a line and the gap voltage has no zero.
-        return [fine, fine + (fine - coarse) / 7.0]
+        # Steps are of third order where the source is a line, but of first order where the gap voltage has a zero: then
+        # the error is all of the difference.
+        return [coarse, fine + (fine - coarse) / 7.0]
 
     def outputs(self, by: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
         """Derivatives of a number, by its outputs, by the modes (m, n + 1) and the source (n + 1,) at all times."""
