@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +16,7 @@ from scipy.stats import binom
 import fingerspice as fs
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
+REFUSED = tomllib.loads(Path(__file__).with_name("refused.toml").read_text("utf-8"))
 LAWS = ("local", "mobile")
 every_law = pytest.mark.parametrize("law", LAWS)
 T = TypeVar("T")
@@ -28,6 +30,12 @@ GAP = {
 def cases(whole: T, few: T) -> T:
     """How many random cases a statistic takes, or which: `whole` in ``make stress``, which sets STRESS, else `few`."""
     return whole if os.environ.get("STRESS") else few
+
+
+def refused(kind: str) -> list[Any]:
+    """A table of `refused.toml`: what is wrong, and what is said."""
+    rows: list[Any] = REFUSED[kind]
+    return rows
 
 
 def by_turns(values: Iterable[T]) -> list[tuple[T, str]]:

@@ -74,34 +74,19 @@ def test_json_is_all_that_is_printed_and_null_stands_for_no_number(command: Comm
     assert sweep["gain"][0] > 0.0
 
 
-def test_two_decks_that_differ_after_a_dot_do_not_share_their_files_which_git_ignores(command: Command) -> None:
-    ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
-    assert "/out/" in ignored
-    for name in ("pad.v1", "pad.v2"):
-        Path(f"{name}.cir").write_text(edited(QUICK))
-        assert command("run", f"{name}.cir", "--no-plot").out.splitlines()[-1] == f"wrote out/{name}.nc"
-    assert {"out/pad.v1.nc", "out/pad.v2.nc"} <= set(tree(Path()))
-
-
-def test_set_changes_values_all_at_once_with_units_and_in_any_case(command: Command) -> None:
+def test_options_are_those_of_the_interface_and_values_change_all_at_once_in_any_case(command: Command) -> None:
     # Either exponent alone would be out of range on its way.
     changes = ["--set", "Xgap.m_exp=1.5", "--set", "xgap.N_EXP = 1.9", "--set", "Xcoat.r=inf"]
-    report = figures(command("run", "pad.cir", "--json", "--no-plot", *changes))
-    circuit = fs.read_netlist("pad.cir").replace({"Xgap.m_exp": 1.5, "Xgap.n_exp": 1.9, "Xcoat.r": float("inf")})
-    assert row(report, "f_el")["mean"] == fs.simulate(circuit).summary()["f_el_mean"]
-    with xarray.open_dataset("out/pad.nc") as data:
-        assert json.loads(data.attrs["overrides"])["Xgap.m_exp"] == "1.5"
-
-
-def test_source_area_method_law_and_rtol_are_those_of_the_interface(command: Command) -> None:
     words = ["--source", "PULSE(-150 150 0 0 0 2m 10m)", "--area", "30u", "--method", "radau"]
-    report = figures(
-        command("run", "pad.cir", "--json", "--no-plot", *words, "--charge-law", "mobile", "--rtol", "1e-6")
-    )
-    circuit = fs.read_netlist("pad.cir").replace({"Vdrive": fs.Pulse(-150, 150, 0, 0, 0, 2e-3, 0.01)})
+    words += ["--charge-law", "mobile", "--rtol", "1e-6", "--json", "--no-plot"]
+    report = figures(command("run", "pad.cir", *changes, *words))
+    circuit = fs.read_netlist("pad.cir").replace({"Xgap.m_exp": 1.5, "Xgap.n_exp": 1.9, "Xcoat.r": float("inf")})
+    circuit = circuit.replace({"Vdrive": fs.Pulse(-150, 150, 0, 0, 0, 2e-3, 0.01)})
     solution = fs.simulate(circuit, area=30e-6, method="radau", charge_law="mobile", rtol=1e-6)
     assert row(report, "u_gap")["max"] == solution.summary()["u_gap_max"]
+    assert row(report, "f_el")["mean"] == solution.summary()["f_el_mean"]
     with xarray.open_dataset("out/pad.nc") as data:
+        assert json.loads(data.attrs["overrides"])["Xgap.m_exp"] == "1.5"
         used = {key: data.attrs[key] for key in ("method", "charge_law", "rtol", "area")}
     assert used == {"method": "radau", "charge_law": "mobile", "rtol": "1e-06", "area": "3e-05 m^2"}
 
@@ -158,9 +143,11 @@ def test_a_skin_at_another_frequency_or_too_much_voltage_is_warned_about_once(co
 
 
 def test_what_the_reader_notices_is_printed_once_with_its_line(command: Command) -> None:
-    lines = ".nodeset v(area)=35\n.backanno\n.meas tran x max v(top)\n.end"
+    lines = ".nodeset v(area)=35\n.backanno\n.meas tran x max v(top)\n.options reltol=1e-4 trtol=7\n.end"
     Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", lines)))
-    first, second = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200").lines
+    result = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200")
+    first, second = (line for line in result.lines if "note" not in line)
+    assert "note: .options reltol, trtol: of no effect here, where --rtol alone sets the error" in result.err
     assert first.startswith("fingerspice: warning: pad.cir:5:41: Xgap r: '1MOhm' is milli (0.001 ohm)")
     assert second == "fingerspice: warning: .meas has no effect here"
 
@@ -260,6 +247,10 @@ def test_stop_and_start_are_those_of_the_interface(command: Command) -> None:
     report = figures(command("run", "pad.cir", "--stop", "10m", "--start", "periodic", "--json", "--no-plot"))
     solution = fs.simulate(fs.read_netlist("pad.cir"), t_stop=0.01, start="periodic")
     assert row(report, "f_el")["mean"] == solution.summary()["f_el_mean"]
+    # The run itself begins at 0.
+    late = fs.parse_netlist(edited((".tran 10u 50m uic", ".tran 50u 18m 12m uic")))
+    report = figures(command("run", "pad.cir", "--stop", "18m", "--start", "12m", "--json", "--no-plot", "--csv"))
+    assert row(report, "f_el")["mean"] == pytest.approx(fs.simulate(late).f_el_mean, rel=1e-6)
     # A deck without .tran needs no more than an end.
     Path("endless.cir").write_text(edited((".tran 10u 50m uic", "*")))
     assert figures(command("run", "endless.cir", "--stop", "10m", "--json", "--no-plot"))["t_stop"] == 0.01

@@ -241,9 +241,3 @@ def test_a_contact_that_friction_takes_away_is_refused_before_the_run_exactly_wh
     for path, value in (("mu", 1.1), ("c2", 5000.0 * (limit / 0.3) ** 2 * 1.0001)):
         with pytest.raises(fs.InputError, match="Xgap has no contact"):
             table1().replace({f"Xgap.{path}": value})
-
-
-@pytest.mark.parametrize(("m", "n"), [(1.41, 0.52), (0.52, 0.52), (0.0, 1.41), (2.0, 2.5), (2.0, 2.0)])
-def test_exponents_outside_the_legal_range_are_refused(m: float, n: float) -> None:
-    with pytest.raises(fs.InputError, match="m_exp"):
-        table1(gap={"m_exp": m, "n_exp": n})

@@ -17,6 +17,7 @@ from fingerspice.netlist.deck import parse_deck
 from fingerspice.netlist.expressions import Call, Number, Token
 from fingerspice.netlist.reader import Deck, Statement, text_of
 from ngspice_tools import call_ngspice
+from scenes import refused
 
 PAPER = """Fingerpad on a 3M-coated touchscreen, Table 1
 .include fingerspice.lib
@@ -182,34 +183,7 @@ def test_text_after_the_end_and_uncalled_subcircuits_are_warned_about() -> None:
     ]
 
 
-REFUSED = {
-    "L1 a b 1m": "is an inductor, which is not supported; elements are R, C, V, I", "tran 1u 1m": "begins with a dot",
-    "5 a b 1": "'5' is no element", ",": "is no element", "(": "is no element", ".": "is not supported",
-    "R1": "missing node", "R1 a": "missing node", "R1 a b": "missing value", "R1 = 5": "the name before '='",
-    "R1 a b (5": r"'\(' is never closed", "R1 a b 5)": "without an opening", "R1 a b 5}": "without an opening",
-    "R1 a b '5": "' is never closed", 'V1 a b "x': '" is never closed', "R1 a {b} 5": "where a node's name belongs",
-    "V1 a b SIN(0 sin(3) 1)": "arithmetic goes in braces", "X1": "needs nodes",
-    "X1 a b area LAYER 1u": "follows the device LAYER", 'X1 a b area "LAYER"': "where a device's name belongs",
-    "X1 a b area LAYER d=1u D=2u": "given twice, first at <netlist>:2:19",
-    "X1 a b area LAYER 1d=1": "cannot be a parameter's name", "+ foo": "there is none",
-    ".param": "write .param name=value", ".param x": "write .param name=value", ".param x=": "missing value of 'x'",
-    ".param =3": "name before '='", ".param f(x)=x": "functions are not supported", ".param x={1": "never closed",
-    ".param x={1}+2": "belongs inside", ".param x=1 2": "operator is missing",
-    ".param x=1\n.param X=2": "defined twice, first at <netlist>:2:8", ".param x=x": "in a circle: x -> x",
-    ".param a=b b=c c=d d=b": "in a circle: d -> b -> c -> d", ".subckt": "write .subckt NAME",
-    ".subckt A a b": "without its .ends", ".subckt A a a\n.ends": "given twice", ".subckt A 0\n.ends": "ground",
-    ".subckt A a w=1 b\n.ends": "nodes come first", ".subckt A a\n.ends B": "the names differ",
-    ".subckt A a\n.ends\n.subckt a b\n.ends": "defined twice, first at <netlist>:2:1",
-    ".subckt A a\nX1 a B\n.ends\n.subckt B a\nX1 a A\n.ends\nX1 b A": "calls itself: A -> B -> A",
-    ".subckt A a wide=1\n.ends\nX1 b A wid=2": "did you mean 'wide'",
-    ".subckt A a b\n.ends\nX1 c A": r"A has 2 nodes \(a b\), 1 given", ".ends": "without a .subckt",
-    ".include": "needs a file name", ".include 'foo": "never closed", ".include a b": "in quotes",
-    ".include foo.lib": "no folder to look in", ".lib foo bar": "sections", ".control\nfoo": "without its .endc",
-    ".endc": "without a .control", ".ic v(a=3": "never closed", ".ic v(a)=": "missing value of 'v",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("text", "message"), REFUSED.items())
+@pytest.mark.parametrize(("text", "message"), refused("lines"))
 def test_what_is_wrong_is_refused_with_its_place(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         parse_deck(f"title\n{text}\n")

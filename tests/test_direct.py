@@ -375,20 +375,6 @@ def fundamental(solution: fs.Solution, x: np.ndarray, f: float) -> complex:
     return complex(2j * np.mean(x * np.exp(-2j * np.pi * f * t)))
 
 
-@pytest.mark.filterwarnings("ignore:.*outside 10 Hz to 100 kHz")
-@pytest.mark.parametrize("f", [1.0, 10.0, 100.0, 1e3, 5e3, 1e4, 1e5])
-@every_law
-def test_periodic_sine_equals_eq_11_in_amplitude_and_phase(f: float, law: str) -> None:
-    circuit = table1(f"SIN(0 200 {f!r})", f)
-    solution = fs.steady_state(circuit, area=AREA, charge_law=law, rtol=1e-12, points=400).solution
-    gains = ref.phasor_gains(f, AREA, ref.table1_layers(f))
-    got = fundamental(solution, solution.u_gap, f) / 200.0
-    assert abs(got - gains[ref.GAP]) <= 1e-10 * abs(gains[ref.GAP])
-    peak = 200.0 * abs(gains[ref.GAP])
-    wave = peak * np.sin(2.0 * np.pi * f * solution.t + np.angle(gains[ref.GAP]))
-    assert np.abs(solution.u_gap - wave).max() <= 1e-10 * peak
-
-
 @pytest.mark.parametrize(("f", "duty"), [(100.0, 0.5), (5000.0, 0.5), (500.0, 0.2)])
 @every_law
 def test_periodic_square_equals_the_matrix_exponential(f: float, duty: float, law: str) -> None:

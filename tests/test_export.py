@@ -233,18 +233,9 @@ def test_random_decks_agree_as_exported(seed: int) -> None:
 def test_the_random_decks_hold_every_device_source_and_directive() -> None:
     decks = [random_deck(seed) for seed in SEEDS]
     circuits = [circuit for _, circuit, _ in decks]
-    elements = [e for c in circuits for e in c.elements]
-    assert {e.device for e in elements} == {"LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP", "R", "C", "V", "I"}
-    waves = {type(e.waveform).__name__ for e in elements if e.waveform is not None}
-    assert waves >= {"DC", "Sine", "Pulse", "Exp", "PWL", "Square"}
-    assert waves & {"Chirp", "Product", "Sawtooth"}
-    for key in ("a_fix", "tau"):
-        assert {e.values[key] > 0.0 for e in elements if e.device == "GAP"} == {True, False}
-    assert {c.charge_law for c in circuits} == {"local", "mobile"}
-    assert {c.tran.uic for c in circuits if c.tran} == {True, False}
-    assert {c.tran.start > 0.0 for c in circuits if c.tran} == {True, False}
-    assert any(c.ac for c in circuits)
-    assert any("." in e.name for e in elements)
+    devices = {e.device for c in circuits for e in c.elements}
+    assert devices == {"LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP", "R", "C", "V", "I"}
+    assert {(c.charge_law, c.tran.uic) for c in circuits if c.tran} == {(law, uic) for law in LAWS for uic in (0, 1)}
     assert {what.split(",")[0] for what, _, _ in decks} == set(NETWORKS)
     assert {what.split(", ")[1] for what, _, _ in decks} == set(SOURCES)
 

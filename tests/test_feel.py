@@ -93,17 +93,6 @@ def test_the_level_of_a_sines_friction_is_that_of_the_formula(frozen: fs.Solutio
     assert found.change_felt
 
 
-def test_a_level_follows_drive_threshold_and_skin_in_decibels(frozen: fs.Solution) -> None:
-    half = fs.simulate(table1("SIN(0 100 100)"), area="frozen", start="periodic", t_stop=0.01)
-    level = feel(frozen, threshold=FLAT).highest
-    # Force goes with the square of the voltage: 20 log10(4).
-    assert feel(half, threshold=FLAT).highest == pytest.approx(level - 40.0 * math.log10(2.0), abs=1e-6)
-    higher = Threshold("higher", FLAT.frequency, FLAT.level + 6.0)
-    assert feel(frozen, threshold=higher).highest == pytest.approx(level - 6.0, abs=1e-9)
-    stiff = SkinMechanics("stiff", 1e-3, 10.0, 1e4)
-    assert feel(frozen, threshold=FLAT, mechanics=stiff).highest == pytest.approx(level - 20.0, abs=1e-9)
-
-
 def test_what_is_weak_or_too_fast_is_not_felt() -> None:
     weak = feel(fs.simulate(table1("SIN(0 2 100)"), start="periodic", t_stop=0.01))
     assert (weak.felt, weak.steps, weak.change_felt) == (False, None, False)

@@ -55,16 +55,6 @@ def test_the_networks_are_of_every_kind() -> None:
         assert len({network.kind[part] for network in drawn}) >= least, part
 
 
-def test_an_error_that_is_stated_too_small_is_counted(judged: list[Beside]) -> None:
-    x = max(judged, key=lambda x: x.true)
-    assert x.covered
-    assert not dataclasses.replace(x, stated=0.9 * x.true).covered
-    # Near rounding there is no ratio.
-    assert dataclasses.replace(x, unknown=x.true).ratio is None
-    lines = network_errors.table([x, dataclasses.replace(x, stated=0.5 * x.true)], lambda x: x.quantity)
-    assert "1 of     2 covered" in lines[0]
-
-
 # Nodes ----------------------------------------------------------------------------------------------------------------
 
 

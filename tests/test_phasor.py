@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.circuit import AcSweep
-from fingerspice.physics.phasor import coupled_area, layer_gains
+from fingerspice.physics.phasor import coupled_area
 from fingerspice.studies.steady import sweep_frequencies
 from ngspice_tools import call_ngspice
 from scenes import deck, table1, table1_deck
@@ -73,11 +73,6 @@ def test_the_skin_is_evaluated_at_each_frequency_of_a_sweep_whatever_its_own_f()
         assert sweep.gain[i] == pytest.approx(
             ref.phasor_gains(x, 35e-6, ref.table1_layers(float(x)))[ref.GAP], rel=1e-13
         )
-
-
-def test_an_open_layer_takes_all_the_voltage() -> None:
-    np.testing.assert_array_equal(layer_gains([1e-6, 0.0, 1e-3]), [0.0, 1.0, 0.0])
-    np.testing.assert_array_equal(layer_gains([0.0, 1e-6, 0.0]), [0.5, 0.0, 0.5])
 
 
 def test_a_gap_or_a_source_turned_round_turns_the_phasor() -> None:
@@ -183,8 +178,6 @@ def test_with_a_given_area_the_gain_is_defined_for_a_source_without_fundamental(
         ("SIN(0 200 100)", math.inf, "mean", "allowed: positive numbers"),
         ("SIN(0 200 100)", [[100.0]], "mean", "allowed: positive numbers"),
         ("SIN(0 200 100)", 100.0, "coupled", "area is 'coupled'; allowed: 'mean', 'frozen' or a number in m^2"),
-        ("SIN(0 200 100)", 100.0, 0.0, "area is 0 m^2; allowed: a positive area in m^2"),
-        ("SIN(0 200 100)", 100.0, math.nan, "area is nan m^2"),
     ],
 )
 def test_what_has_no_phasor_is_refused_with_what_is_allowed(source, frequency, area, message: str) -> None:

@@ -192,19 +192,6 @@ def test_a_picture_has_150_dots_an_inch_or_more_and_a_folder_that_can_be_written
         drawing.save(figure, tmp_path / "new" / "run.png" / "run.png")
 
 
-@pytest.mark.parametrize(
-    ("peak", "unit", "least", "factor", "shown"),
-    [
-        (0.05, "s", 1.0, 1e3, "ms"), (2e-4, "s", 1.0, 1e6, "µs"), (1e-3, "s", 1.0, 1e3, "ms"),
-        (1.0, "s", 1.0, 1.0, "s"), (0.21, "N", 0.05, 1.0, "N"), (0.004, "N", 0.05, 1e3, "mN"),
-        (200.0, "V", 2.0, 1.0, "V"), (0.0, "V", 2.0, 1.0, "V"), (math.nan, "V", 2.0, 1.0, "V"),
-        (3.5e-5, "m^2", 0.05, 1e6, "mm²"), (5e3, "mm^4/N^2", 1.0, 1.0, "mm^4/N^2"),
-    ],
-)  # fmt: skip
-def test_engineering_units(peak: float, unit: str, least: float, factor: float, shown: str) -> None:
-    assert drawing.engineering(peak, unit, least) == (pytest.approx(factor), shown)
-
-
 def test_thinning_keeps_every_extreme_and_both_ends() -> None:
     t = np.linspace(0.0, 1.0, 123_457)
     x = np.sin(2e4 * t)

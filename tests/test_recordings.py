@@ -163,17 +163,6 @@ def test_what_is_no_recording_is_stepped_as_ever() -> None:
     assert steep.success
 
 
-def test_charge_and_force_belong_to_the_gap_voltage() -> None:
-    run = follow(fs.Samples(recording(), RATE), 0.0195, t_eval=np.arange(150) / RATE, rtol=1e-8)
-    force = analytic.contact(np.abs(run.u_gap))[3]
-    assert np.abs(run.f_el - force).max() <= 1e-12 * force.max()
-    # The current is the charge's slope: between two samples both are smooth.
-    t = 20.3 / RATE + np.array([-1.0, 0.0, 1.0]) * 1e-3 / RATE
-    near = follow(fs.Samples(recording(), RATE), 0.0195, t_eval=t, rtol=1e-10)
-    slope = (near.q_source[2] - near.q_source[0]) / (t[2] - t[0])
-    assert near.i_source[1] == pytest.approx(slope, rel=1e-6)
-
-
 def test_figures_are_those_of_the_run_and_not_of_its_outputs() -> None:
     samples, stop = fs.Samples(recording(), RATE), 0.0195
     rare = follow(samples, stop, t_eval=[0.0, stop], rtol=1e-6)

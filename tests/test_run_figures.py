@@ -203,16 +203,6 @@ def test_a_gap_alone_has_them_too() -> None:
 # Whatever outputs, and however the steps are kept
 
 
-def test_the_papers_square_of_100_hz_has_its_mean_whatever_the_output_step() -> None:
-    # 2.4 % off with TSTEP 1 ms, from the outputs.
-    means = [
-        fs.simulate(table1(tran=f"{step} 50m uic"), sources={"Vdrive": fs.Square(200.0, 100.0)}).f_el_mean_periodic
-        for step in ("10u", "300u", "1m", "7m")
-    ]
-    expected = ref.transient(ref.square_segments(200.0, 100.0, 5), [0.0], freq=100.0).mean_force(0.04, 0.05)
-    np.testing.assert_allclose(means, expected, rtol=1e-8)
-
-
 RANDOM = [
     ("local", "SIN(0 200 100)", "fingerpad"), ("mobile", "SIN(0 200 5k)", "fingerpad"),
     ("local", "PULSE(-150 150 0 1u 1u 99u 200u)", "fingerpad"), ("local", "SIN(20 100 1k 0.3m 500 30)", "fingerpad"),

@@ -244,11 +244,6 @@ def test_a_dispersive_skin_has_no_f_and_takes_its_thickness() -> None:
 # Names, tables and bad input.
 
 
-def test_names_are_read_in_upper_and_lower_case() -> None:
-    for name in ("FORSBACH2021", " forsbach2021 ", "Forsbach2021"):
-        assert fs.parameters(name).name == "Forsbach2021"
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
@@ -443,27 +438,6 @@ def test_one_of_several_fingers_may_be_named(command: Command) -> None:
     Path("two.cir").write_text((CIRCUITS / "two_fingers.cir").read_text())
     _, changed = applied(command, "--finger", "Xlight=moist", "--finger", "xfirm = dry", deck="two.cir")
     assert [changed[f"{one}.Xgap.r"] for one in ("Xlight", "Xfirm")] == ["100000.0", "7000000.0"]
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("run --finger 3M", "--finger '3M': the set '3M' is a coating, not a finger; allowed: dry, moist, normal"),
-        ("run --finger moits", "--finger 'moits': unknown finger set 'moits'; nearest: 'moist'"),
-        ("run --drive Xgap=TeslaTouch", "--drive 'Xgap=TeslaTouch': the set 'TeslaTouch' has values for a driving"),
-        ("run --coating Xlayer=3M", "a LAYER, which 'Xlayer' of the circuit lacks; allowed: its Xcoat"),
-        ("plan --set moits", "--set 'moits': unknown set 'moits'; nearest: 'moist', 'light'; or PATH=VALUE"),
-        ("compare --set ", "--set '' is not understood; allowed: PATH=VALUE"),
-        ("ac --finger moist", "--finger 'moist' is a set of parameters, and here a GAP is meant; allowed: --set mo"),
-        ("ac --finger Xgpa", "Xgpa"),
-    ],
-)
-def test_wrong_names_on_the_command_line_are_refused(command: Command, words: str, said: str) -> None:
-    kind, *options = words.split(" ")
-    result = command(kind, "pad.cir", *options)
-    assert result.code == 2
-    assert said in result.err
-    assert "Traceback" not in result.err
 
 
 def test_the_sets_are_listed_and_shown(command: Command) -> None:

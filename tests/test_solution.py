@@ -18,7 +18,6 @@ import xarray
 import analytic as ref
 import fingerspice as fs
 from commands import tree
-from fingerspice.base import files
 from fingerspice.base.files import write_aside
 from fingerspice.results.record import SIGNALS
 from scenes import deck, shipped, table1
@@ -198,15 +197,8 @@ def test_figures_of_the_source_of_a_square_are_by_hand(square: fs.Solution) -> N
 
 
 def test_a_circuit_without_gap_has_figures_of_its_layers(tmp_path: Path) -> None:
-    solution = fs.simulate(
-        deck(
-            "V1 a 0 SIN(0 10 100)",
-            "X1 a b area LAYER d=1u eps_r=2 r=1meg",
-            "X2 b 0 area LAYER d=2u eps_r=3 r=1meg",
-            "Varea area 0 35",
-            ".tran 100u 20m uic",
-        )
-    )
+    layers = "X1 a b area LAYER d=1u eps_r=2 r=1meg", "X2 b 0 area LAYER d=2u eps_r=3 r=1meg"
+    solution = fs.simulate(deck("V1 a 0 SIN(0 10 100)", *layers, "Varea area 0 35", ".tran 100u 20m uic"))
     s = solution.summary()
     assert (s["t_stop"], s["status"]) == (0.02, "SUCCESS")
     top = solution.u_layer[:, 0].max()
@@ -303,43 +295,29 @@ def test_a_failed_run_keeps_what_came_before_it(tmp_path: Path) -> None:
     assert [s.name for s in fs.Status if "success" in s.value] == ["SUCCESS"]
 
 
-def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full(
+def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full_or_writing_is_interrupted(
     square: fs.Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, write_to: Any) -> Path:
+    def broken_off(path: Path, write_to: Any) -> Path:
         def half(target: Path) -> None:
             target.write_text("half of a file")
-            raise OSError(errno.ENOSPC, "No space left on device")
+            raise error
 
         return write_aside(path, half)
 
-    monkeypatch.setattr("fingerspice.base.files.write_aside", full)
-    for there in ({}, {"run.dat": b"before"}):
-        for name, content in there.items():
-            (tmp_path / name).write_bytes(content)
-        for write in (square.to_csv, square.to_netcdf):
-            with pytest.raises(fs.InputError, match=r"cannot write .*run\.dat: No space left on device"):
-                write(tmp_path / "run.dat")
-            assert tree(tmp_path) == there
-
-
-def test_nothing_is_left_when_writing_breaks_off_for_any_reason(tmp_path: Path) -> None:
-    def interrupted(target: Path) -> None:
-        target.write_text("half")
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_aside(tmp_path / "x.csv", interrupted)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_made_is_refused(square: fs.Solution, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    for path in (tmp_path / "file" / "run.nc", tmp_path / "file" / "deeper" / "run.nc"):
-        with pytest.raises(fs.InputError, match=r"cannot write .*allowed: a folder that can be written"):
-            square.to_netcdf(path)
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
-    assert files.write_aside(tmp_path / "new" / "x.txt", lambda p: p.write_text("x")).read_text() == "x"
+    monkeypatch.setattr("fingerspice.base.files.write_aside", broken_off)
+    for error, told, said in (  # noqa: B007
+        (OSError(errno.ENOSPC, "No space left on device"), fs.InputError, r"write .*run\.dat: No space left on device"),
+        (KeyboardInterrupt(), KeyboardInterrupt, None),
+    ):
+        for there in ({}, {"run.dat": b"before"}):
+            for name, content in there.items():
+                (tmp_path / name).write_bytes(content)
+            for write in (square.to_csv, square.to_netcdf):
+                with pytest.raises(told, match=said):
+                    write(tmp_path / "run.dat")
+                assert tree(tmp_path) == there
+        (tmp_path / "run.dat").unlink()
 
 
 def test_states_status_and_elements_show_themselves_in_one_short_line(square: fs.Solution) -> None:

@@ -21,21 +21,11 @@ AREA = "Varea area 0 35"
 X = "LAYER d=1u eps_r=2"
 ISLAND = "is floating: nothing connects it to ground"
 REFUSALS = {
-    "a layer on another area": (
-        [V, COAT.replace(" area ", " Elsewhere "), GAP],
-        "node 'Elsewhere' gives Xcoat its area, but no GAP and no DC source drives it",
-    ),
     "area driven by nothing": ([V, COAT, SLAB], "node 'area' gives Xcoat its area, but no GAP and no DC source"),
     "area driven twice": ([V, COAT, SLAB, AREA, "Vmore area 0 35"], "more than one source drives it"),
-    "layers on two areas": (
-        [V, COAT, SLAB.replace(" area ", " other "), AREA],
-        "node 'other' gives Xslab its area, but no GAP and no DC source drives it",
-    ),
     "area that varies": ([V, COAT, SLAB, "Varea area 0 SIN(35 1 100)"], "Varea drives an area: allowed is a DC value"),
     "area upside down": ([V, COAT, SLAB, "Varea 0 area 35"], "Varea drives an area: allowed is a DC value"),
     "area of zero": ([V, COAT, SLAB, "Varea area 0 0"], "Varea drives an area: allowed is a DC value above 0"),
-    "area below zero": ([V, COAT, SLAB, "Varea area 0 -35"], "Varea drives an area"),
-    "dangling end": ([V, COAT, GAP.replace("n1 0", "n1 Loose")], "node 'Loose' is floating: only Xgap touches it"),
     "island": ([V, COAT, GAP, f"Xlost q r area {X}", f"Xmore q r area {X}"], ISLAND),
     "no ground": ([V.replace(" 0 ", " n9 ", 1), COAT, GAP.replace("n1 0", "n1 n9")], "no element touches ground"),
     "area node as a conductor": ([V, "Xcoat n0 area area LAYER d=1u eps_r=3.9", GAP], "is floating"),
@@ -46,8 +36,6 @@ REFUSALS = {
         "Idrive is a current source without a path: node 'drive' is reached through current sources only",
     ),
     "area node under a resistor": ([V, COAT, GAP, "Rx area 0 1k"], "Rx and Xgap both drive the area node 'area'"),
-    "dangling resistor": ([V, COAT, GAP, "R2 n0 Loose 1k"], "node 'Loose' is floating: only R2 touches it"),
-    "no source in the loop": ([COAT.replace("n0", "0"), SLAB, AREA], "the circuit has no source"),
 }
 
 
@@ -61,12 +49,6 @@ def test_a_topology_that_is_not_a_driven_stack_is_refused_by_name_and_with_its_p
         assert caught.value.where is not None
         name = lines[caught.value.where.line - 2].split()[0]
         assert name in str(caught.value), f"line {caught.value.where.line} is {name}"
-
-
-def test_these_stacks_are_accepted() -> None:
-    for lines in ([V, COAT, GAP], [V, COAT, SLAB, AREA], [V, GAP.replace("n1", "n0")]):
-        deck(*lines)
-    deck(V.replace("n0 0", "n0 gnd"), COAT, GAP.replace(" 0 ", " GND "))
 
 
 NETWORKS = {
@@ -102,15 +84,11 @@ def test_what_is_not_a_stack_is_a_network(case: str) -> None:
 def test_every_parameter_is_listed_by_path_with_value_and_unit() -> None:
     parameters = table1().parameters
     expected = {
-        "Vdrive.amplitude": (200.0, "V"), "Vdrive.frequency": (100.0, "Hz"), "Vdrive.offset": (0.0, "V"),
-        "Xcoat.d": (1e-6, "m"), "Xcoat.eps_r": (3.9, ""), "Xcoat.r": (2e5, "ohm"), "Xgap.d": (3.5e-6, "m"),
-        "Xgap.r": (1e6, "ohm"), "Xgap.fn": (0.5, "N"), "Xgap.mu": (0.3, ""), "Xgap.alpha": (54.4, "mm^2/N^m"),
-        "Xgap.m_exp": (0.52, ""), "Xgap.beta": (32.0, "mm^(2-n)"), "Xgap.n_exp": (1.41, ""),
-        "Xgap.c2": (5000.0, "mm^4/N^2"), "Xgap.a_fix": (0.0, "mm^2"), "Xskin.d": (350e-6, "m"),
-        "Xskin.f": (100.0, "Hz"),
+        "Vdrive.amplitude": (200.0, "V"), "Vdrive.frequency": (100.0, "Hz"), "Xcoat.eps_r": (3.9, ""),
+        "Xcoat.r": (2e5, "ohm"), "Xgap.d": (3.5e-6, "m"), "Xgap.fn": (0.5, "N"), "Xgap.alpha": (54.4, "mm^2/N^m"),
+        "Xgap.beta": (32.0, "mm^(2-n)"), "Xgap.c2": (5000.0, "mm^4/N^2"), "Xgap.a_fix": (0.0, "mm^2"),
     }  # fmt: skip
-    for path, (value, unit) in expected.items():
-        assert (parameters[path].value, parameters[path].unit) == (value, unit), path
+    assert {path: (parameters[path].value, parameters[path].unit) for path in expected} == expected
     with pytest.raises(TypeError):
         parameters["Xgap.d"] = 1.0  # type: ignore[index]
 
@@ -130,19 +108,3 @@ def test_replace_changes_one_parameter_and_changing_it_back_restores_the_circuit
         assert changed.replace({path: parameter.value}).elements == circuit.elements
         assert circuit.parameters[path].value == parameter.value
         assert path in changed.overrides
-
-
-def test_a_source_is_replaced_by_a_waveform_a_number_or_a_function() -> None:
-    circuit = table1()
-    assert circuit.replace({"Vdrive": fs.Square(200.0, 50.0)})["Vdrive"].waveform == fs.Square(200.0, 50.0)
-    assert circuit.replace({"vdrive": 5})["Vdrive"].waveform == fs.DC(5.0)
-    changed = circuit.replace({"Vdrive": np.sin})["Vdrive"].waveform
-    assert isinstance(changed, fs.Function)
-    duty = circuit.replace({"Vdrive": fs.Square(200.0, 50.0)}).replace({"Vdrive.duty": 0.3})
-    assert duty["Vdrive"].waveform == fs.Square(200.0, 50.0, duty=0.3)
-
-
-def test_an_element_is_found_in_any_case_and_an_unknown_one_has_its_nearest_named() -> None:
-    assert table1()["XGAP"].name == "Xgap"
-    with pytest.raises(fs.InputError, match="unknown element 'Xgop'; nearest: 'Xgap'"):
-        table1()["Xgop"]

@@ -89,20 +89,6 @@ def test_outputs_between_the_points_and_pauses_between_bursts() -> None:
     assert run.stats["steps"] > late.size + 100
 
 
-def test_the_same_signal_on_an_even_grid_gives_the_same_result() -> None:
-    circuit, rate = circuit_of("SKIN"), 48e3
-    t = np.arange(2000) / rate
-    v = 100.0 * np.sin(2.0 * np.pi * 333.0 * t)
-    even = fs.simulate(circuit, sources=fs.Samples(v, rate), t_eval=t, t_stop=t[-1], rtol=1e-7)
-    # One point more, on the line, makes the times uneven.
-    extra = np.sort(np.append(t, t[700] + 0.3 / rate))
-    wave = fs.PWL(extra, np.interp(extra, t, v))
-    uneven_run = fs.simulate(circuit, sources=wave, t_eval=t, t_stop=t[-1], rtol=1e-7)
-    assert (even.method, uneven_run.method) == ("relaxation", "relaxation")
-    bound = even.error.u_gap + uneven_run.error.u_gap
-    assert float(np.abs(even.u_gap - uneven_run.u_gap).max()) <= bound
-
-
 @pytest.mark.parametrize("start", ["dc", "uncharged"])
 def test_a_run_may_start_with_charge(start: str) -> None:
     t, v = points(3)
