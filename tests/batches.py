@@ -1,7 +1,5 @@
 """Scenes for `fs.batch`, and what single runs and stated errors make of their figures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

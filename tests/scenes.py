@@ -1,7 +1,5 @@
 """Circuits for the tests: Table 1's deck with the changes that a test needs."""
 
-from __future__ import annotations
-
 import os
 import re
 import tomllib
@@ -16,7 +14,8 @@ from scipy.stats import binom
 import fingerspice as fs
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
-REFUSED = tomllib.loads(Path(__file__).with_name("refused.toml").read_text("utf-8"))
+DECKS = Path(__file__).with_name("decks")
+CASES = tomllib.loads(Path(__file__).with_name("cases.toml").read_text("utf-8"))
 LAWS = ("local", "mobile")
 every_law = pytest.mark.parametrize("law", LAWS)
 T = TypeVar("T")
@@ -32,9 +31,9 @@ def cases(whole: T, few: T) -> T:
     return whole if os.environ.get("STRESS") else few
 
 
-def refused(kind: str) -> list[Any]:
-    """A table of `refused.toml`: what is wrong, and what is said."""
-    rows: list[Any] = REFUSED[kind]
+def listed(kind: str) -> list[Any]:
+    """A table of `cases.toml`, such as of what is wrong and what is said."""
+    rows: list[Any] = CASES[kind]
     return rows
 
 

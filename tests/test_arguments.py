@@ -1,7 +1,5 @@
 """Arguments of a call that replace the circuit's own data, and the one-sentence error for a wrong argument."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 from typing import Any

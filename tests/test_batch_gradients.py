@@ -1,7 +1,5 @@
 """`fs.batch(gradients=...)`, against fourth-order differences of single runs at 1e-12, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +45,6 @@ def expected(scene: Circuit, path: str, how: dict[str, Any]) -> dict[str, float]
     return total
 
 
-def uneven() -> Circuit:
-    """A source of points at uneven times."""
-    t = np.linspace(0.0, 0.05, 701)
-    times = np.sort(np.append(t, t[:-1] + 0.3 * np.diff(t)))
-    return table1().replace({"Vdrive": fs.PWL(times, 150.0 * np.sin(2.0 * np.pi * 150.0 * times))})
-
-
 TWO, CLOCK = {"Xgap.d": [3e-6, 4e-6]}, ("Vdrive.frequency", "Xgap.d")
 OWN, FOLLOWED = ("Xgap.d", "Xcoat.r"), {"Vdrive.frequency": [80.0, 400.0]}
 BY_TURNS, FOLLOW, PERIODIC = {"periods": 3}, {"periods": 3, "skin": "follow"}, {"periodic": True}
@@ -74,7 +65,6 @@ CASES: dict[str, tuple[Any, ...]] = {
     "frequency, of the deck": (1, table1(), THREE, CLOCK, (1e-5,), {}),
     "followed": (0, table1(), FOLLOWED, CLOCK, (1e-5,), FOLLOW),
     "followed, alone": (1, table1(), FOLLOWED, CLOCK, (1e-9,), FOLLOW),
-    "uneven points": (1, uneven(), {"Xgap.d": [3e-6]}, ("Xgap.d", "Xgap.r"), (1e-5,), {}),
 }  # fmt: skip
 for kind in ("sine", "square"):
     for law in ({}, MOBILE):

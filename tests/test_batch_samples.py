@@ -1,7 +1,5 @@
 """Recordings in lockstep: against single runs, in wide populations, for any threads, order and bad scenes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

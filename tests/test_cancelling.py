@@ -1,7 +1,5 @@
 """Sources that cancel, carriers that coarse samples miss, common periods, and runs whose work does not jump."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

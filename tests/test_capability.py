@@ -1,7 +1,5 @@
 """The map of the friction that a screen can produce: its limits against other methods, and the command."""
 
-from __future__ import annotations
-
 import cmath
 import json
 import math

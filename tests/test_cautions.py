@@ -1,7 +1,5 @@
 """Warnings about successful runs: they appear from the stated limits of voltage and area on."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

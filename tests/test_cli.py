@@ -1,7 +1,5 @@
 """The command line: files, printed text and exit codes; bad input gets one sentence and leaves no file behind."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import fcntl
@@ -121,7 +119,12 @@ def test_a_solve_that_fails_keeps_what_it_has_and_says_when_and_how_close(comman
         assert data.attrs["status"] == "FOLD"
         assert float(data.time[-1]) == pytest.approx(float(said[1]), rel=1e-9)
         assert f"{float(data.u_gap[-1]):.4g}" == said[2]
-    assert f"status: {report['message']}" in command(*words).out
+    keys = ("status", "cause", "action", "t", "step", "element", "u_gap", "area", "fold_margin", "tried")
+    assert set(report["failure"]) == set(keys)
+    assert set(report["failure"]["tried"][0]) == {"t", "step", "error"}
+    plain = command(*words).out
+    assert f"status: {report['message']}" in plain
+    assert "last steps tried:" in plain
 
 
 # Warnings and notes

@@ -1,7 +1,5 @@
 """Bad input on the command line: one sentence on stderr, exit code 2, and no file written or left behind."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import shlex
@@ -14,7 +12,7 @@ import pytest
 
 from commands import Command, tree
 from deck_edits import edited
-from scenes import cases, refused
+from scenes import cases, listed
 
 FINGERSPICE = str(Path(sys.executable).with_name("fingerspice"))
 
@@ -37,9 +35,9 @@ def folder(command: Command, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        *((["run", "pad.cir", "--out", "new", *words], said) for words, said in refused("options")),
-        *refused("commands"),
-        *refused("usage"),
+        *((["run", "pad.cir", "--out", "new", *words], said) for words, said in listed("options")),
+        *listed("commands"),
+        *listed("usage"),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
 )
@@ -49,7 +47,7 @@ def test_bad_input_gets_a_sentence_and_leaves_nothing(
     before = tree(folder)
     result = command(*arguments)
     assert (result.code, result.out) == (2, "")
-    if [arguments, said] in refused("usage"):
+    if [arguments, said] in listed("usage"):
         assert said in result.err
         assert "--help" in result.err
     else:
@@ -77,7 +75,7 @@ def test_a_fault_of_the_program_is_a_sentence_with_its_place(command: Command, m
     assert set(tree(Path())) == {"pad.cir"}
 
 
-@pytest.mark.parametrize(("words", "said"), refused("checked_first"))
+@pytest.mark.parametrize(("words", "said"), listed("checked_first"))
 def test_arguments_are_checked_before_files(command: Command, words: str, said: str) -> None:
     Path("out").mkdir()
     for end in (".nc", "_ac.csv", "_compare.png", "_limits.csv", "_capability.csv", "_drive.wav"):

@@ -1,7 +1,5 @@
 """Compiled code and its cache: full disks, killed processes, changed sources; and tuples passed by their address."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import os
@@ -47,7 +45,6 @@ def strike(*names):
     replace(*names)
 caching.os.replace = strike
 """
-
 
 # No folder can be written, the package's neither, as for one that others installed.
 SHUT = """

@@ -1,7 +1,5 @@
 """Ridge contact area: Eqs. 1 to 7 against references of 30 and more digits, and the laws that the equations obey."""
 
-from __future__ import annotations
-
 import math
 
 import mpmath as mp

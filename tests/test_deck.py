@@ -1,7 +1,5 @@
 """Conversion of netlist text to flat, evaluated statements."""
 
-from __future__ import annotations
-
 import random
 import re
 import subprocess
@@ -17,19 +15,7 @@ from fingerspice.netlist.deck import parse_deck
 from fingerspice.netlist.expressions import Call, Number, Token
 from fingerspice.netlist.reader import Deck, Statement, text_of
 from ngspice_tools import call_ngspice
-from scenes import refused
-
-PAPER = """Fingerpad on a 3M-coated touchscreen, Table 1
-.include fingerspice.lib
-Vdrive  drive 0          SIN(0 200 100)
-Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg
-Xgap    top   skin area  GAP   d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4
-+ m_exp=0.52 beta=32 n_exp=1.41 c2=5000   ; Table 1
-Xskin   skin  gnd  AREA  SKIN  d=350u f=100
-.tran 10u 50m uic
-.nodeset v(area)=34.97
-.end
-"""
+from scenes import DECKS, listed
 
 
 def deck(*lines: str) -> Deck:
@@ -53,7 +39,7 @@ def value(item: object) -> float:
 
 
 def test_places_are_physical_lines_and_columns_also_on_continuations() -> None:
-    gap = parse_deck(PAPER).statements[2]
+    gap = parse_deck((DECKS / "continued.cir").read_text("utf-8")).statements[2]
     assert gap.where == Where("<netlist>", 5, 1)
     assert gap.params["m_exp"].key == Where("<netlist>", 6, 3)
     assert gap.params["c2"].where == Where("<netlist>", 6, 36)
@@ -183,7 +169,7 @@ def test_text_after_the_end_and_uncalled_subcircuits_are_warned_about() -> None:
     ]
 
 
-@pytest.mark.parametrize(("text", "message"), refused("lines"))
+@pytest.mark.parametrize(("text", "message"), listed("lines"))
 def test_what_is_wrong_is_refused_with_its_place(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         parse_deck(f"title\n{text}\n")

@@ -3,8 +3,6 @@
 Run as a program, this file prints a digest of every scene, for processes with other settings.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

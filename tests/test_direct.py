@@ -3,8 +3,6 @@
 Also what they make of samples: the response of linear modes, against extended precision, mpmath and ramps.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable
@@ -237,16 +235,6 @@ def test_samples_at_other_times_are_taken_there(shift: float) -> None:
     assert np.abs(quick.u_layer - slow.u_layer).max() <= quick.error.u_gap + slow.error.u_gap + 1e-12 * 60.0
 
 
-@pytest.mark.parametrize("keep", [slice(0, 200), slice(1, None), slice(0, None, 2)])
-def test_some_of_the_samples_times_are_as_good_as_all(keep: slice) -> None:
-    values = np.random.default_rng(8).normal(0.0, 60.0, 401)
-    t = np.arange(401) / 48e3
-    source = fs.Samples(values, 48e3)
-    whole = linear(source, t, 400 / 48e3, charge=False)
-    some = linear(source, t[keep], float(t[keep][-1]), charge=False)
-    assert np.abs(some.u_layer - whole.u_layer[keep]).max() <= 1e-12 * np.abs(values).max()
-
-
 def layered(rng: np.random.Generator, layers: int) -> tuple[fs.Circuit, list[ref.Layer]]:
     """A stack of random layers at a sine of 10 V and 500 Hz, and its layers as the reference takes them."""
     d, eps, r = rng.uniform(1e-6, 1e-4, layers), rng.uniform(1.0, 50.0, layers), 10.0 ** rng.uniform(5.0, 7.0, layers)
@@ -369,12 +357,6 @@ def test_a_source_that_is_never_finite_leaves_the_state_as_it_was(tier: str) -> 
 # The periodic state, and areas by their names -------------------------------------------------------------------
 
 
-def fundamental(solution: fs.Solution, x: np.ndarray, f: float) -> complex:
-    """Complex amplitude of x ~ Im(P exp(i 2 pi f t)) over one period on an even grid."""
-    t, x = solution.t[:-1], x[:-1]
-    return complex(2j * np.mean(x * np.exp(-2j * np.pi * f * t)))
-
-
 @pytest.mark.parametrize(("f", "duty"), [(100.0, 0.5), (5000.0, 0.5), (500.0, 0.2)])
 @every_law
 def test_periodic_square_equals_the_matrix_exponential(f: float, duty: float, law: str) -> None:
@@ -395,29 +377,6 @@ def test_mean_and_frozen_areas_are_what_their_names_say() -> None:
     assert mean.area == pytest.approx(ref.coupled_phasor(100.0, 200.0).area, rel=1e-12, abs=0.0)
     with pytest.raises(fs.InputError, match="this source has none"):
         fs.simulate(table1(), sources={"Vdrive": fs.DC(10.0)}, area="mean")
-
-
-@pytest.mark.filterwarnings("ignore:.*outside 10 Hz to 100 kHz")
-@pytest.mark.parametrize(
-    ("f", "skin", "limit"), [(0.01, 1.0, ref.gap_limit_eq14(1.0, AREA)), (1e8, 1e5, ref.gap_limit_eq15(1e5))]
-)
-def test_the_low_limit_is_resistive_and_the_high_one_capacitive_eqs_14_and_15(
-    f: float, skin: float, limit: float
-) -> None:
-    solution = fs.steady_state(table1(f"SIN(0 200 {f!r})", skin), area=AREA, rtol=1e-10, points=200).solution
-    assert abs(fundamental(solution, solution.u_gap, f)) / 200.0 == pytest.approx(limit, rel=1e-6)
-
-
-def test_a_pure_capacitor_stack_follows_the_source_without_delay() -> None:
-    lines = (
-        "V1 a 0 SIN(0 10 1k)", "X1 a b area LAYER d=1u eps_r=2", "X2 b 0 area LAYER d=3u eps_r=2", "Varea area 0 40"
-    )  # fmt: skip
-    solution = fs.simulate(deck(*lines, ".tran 10u 2m uic"))
-    assert np.abs(solution.u_layer[:, 0] - 0.25 * solution.u_source).max() <= 1e-13 * 10.0
-    c = 8.854e-12 * 2.0 * 40e-6 / 4e-6
-    assert np.abs(solution.q_source - c * solution.u_source).max() <= 1e-8 * c * 10.0
-    assert solution.f_el is None
-    assert solution.u_gap is None
 
 
 @every_law

@@ -1,7 +1,5 @@
 """The dispersive stratum corneum: its ladder, its fit, and its effect in every tier."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The documentation: the code of every page runs, its links lead somewhere, no public name is missing; the gallery."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """Decks written for LTspice, ngspice or by other authors: the supported ones load, the others get clear messages."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings
@@ -18,10 +16,10 @@ from fingerspice.circuit.circuit import Tran
 from fingerspice.netlist.lexer import decimal_comma
 from fingerspice.netlist.reader import ELSEWHERE, LIBRARIES, library_text
 from ngspice_tools import call_ngspice, run_ngspice, with_max_step
+from scenes import DECKS
 
 TRAN = ".tran 10u 50m uic"
-OTHERS = Path(__file__).with_name("decks")
-DECKS = sorted(OTHERS.glob("*.cir"))
+OTHERS = sorted((DECKS / "others").glob("*.cir"))
 
 
 def read(*changes: tuple[str, str]) -> tuple[fs.Circuit, list[str]]:
@@ -34,27 +32,10 @@ def read(*changes: tuple[str, str]) -> tuple[fs.Circuit, list[str]]:
 
 # LTspice
 
-#: As LTspice XVII saves a schematic: Latin-1, CRLF, SINE, two numbers less in .tran, parasitics, parts' data.
-LTSPICE = """\
-* C:\\Users\\M\xfcller\\finger.asc
-V1 N001 0 SINE(0 200 100) Rser=1k
-XU1 N001 N002 area LAYER d=1\xb5 eps_r=3.9 r=0.2Meg
-XU2 N002 N003 area GAP d=3.5\xb5 r=1Meg
-XU3 N003 0 area SKIN d=350\xb5m f=100
-R1 N001 0 10Meg tol=1 pwr=0.1
-C1 N001 0 100p V=250 Irms=0 Rser=50 Rpar=1G Cpar=1p mfg="KEMET" pn="C0402" type="X7R"
-.tran 0 20m 0 10\xb5
-.lib fingerspice.lib
-.options plotwinsize=0 numdgt=7
-.backanno
-.end
-"""
 
-
-def test_what_ltspice_saves_loads_and_is_the_same_circuit_as_ours(tmp_path: Path) -> None:
-    path = tmp_path / "finger.net"
-    path.write_bytes(LTSPICE.replace("\n", "\r\n").encode("latin-1"))
-    theirs = fs.read_netlist(path)
+def test_what_ltspice_saves_loads_and_is_the_same_circuit_as_ours() -> None:
+    # As LTspice XVII saves a schematic: Latin-1, CRLF, SINE, two numbers less in .tran, parasitics, parts' data.
+    theirs = fs.read_netlist(DECKS / "ltspice.net")
     assert theirs.title == "* C:\\Users\\M\xfcller\\finger.asc"
     assert theirs.warnings == ()
     assert theirs.unused == (".options plotwinsize", ".options numdgt")
@@ -257,7 +238,7 @@ def test_a_library_outside_the_decks_folder_is_not_looked_at(tmp_path: Path) -> 
 
 
 @pytest.mark.filterwarnings("ignore:.*(has no effect here|usual range)")
-@pytest.mark.parametrize("path", DECKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", OTHERS, ids=lambda path: path.stem)
 def test_decks_of_other_tools_have_ngspices_voltages(path: Path, tmp_path: Path) -> None:
     text = path.read_text("utf-8")
     circuit = fs.parse_netlist(text)
@@ -279,5 +260,5 @@ def test_decks_of_other_tools_have_ngspices_voltages(path: Path, tmp_path: Path)
 
 
 def test_a_pulse_charges_what_hangs_on_a_name_with_brackets() -> None:
-    s = fs.simulate(fs.read_netlist(OTHERS / "kicad_eagle_busses.cir"), t_eval=[1.005e-6 + 4e-6])
+    s = fs.simulate(fs.read_netlist(DECKS / "others" / "kicad_eagle_busses.cir"), t_eval=[1.005e-6 + 4e-6])
     assert s.node_voltages["Net-(C1-Pad1)"][0] == pytest.approx(1.0 - math.exp(-4.0 / 5.0), rel=1e-5)

@@ -1,7 +1,5 @@
 """The stated error: between the true error and 10 times the true error, on 95 % of random scenes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The explorer: its scenes equal `fs.simulate`, its server answers whom it may, and nothing makes it stumble."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import http.client

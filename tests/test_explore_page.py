@@ -1,7 +1,5 @@
 """The explorer's page in a real browser; skipped where Playwright or Chromium is missing."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Kills, interrupts, full disks and closed pipes: files are complete or absent, exit codes are right, reruns work."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Estimated perception: the skin's mechanics, the thresholds against their sources, levels, and the command line."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

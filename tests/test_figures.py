@@ -1,7 +1,5 @@
 """The paper's figures, computed by the package, and the numbers that the paper's text gives about them."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 
@@ -129,23 +127,10 @@ def test_figs_4_and_5_are_two_periods_of_the_periodic_state(folder: Path, number
         assert jumps == (3 if number == 5 else 0)
 
 
-def test_numbers_of_the_time_responses_are_those_of_a_long_run_and_of_the_papers_figures() -> None:
+def test_a_time_response_is_the_end_of_a_long_run() -> None:
     long = fs.simulate(table1(), t_stop=0.1, rtol=1e-8)
     sine = figures.time_response(fs.Sine, 100.0)
     assert sine.summary()["f_el_mean_periodic"] == pytest.approx(long.summary()["f_el_mean_periodic"], rel=1e-5)
-    # The square wave's force is volatile at 100 Hz and nearly constant at 5 kHz.
-    for f, wanted in ((100.0, (0.1845, 0.5826, 0.2278)), (5000.0, (0.3326, 0.3829, 0.3550))):
-        s = figures.time_response(fs.Square, f)
-        found = s.f_el.min(), s.f_el.max(), s.summary()["f_el_mean_periodic"]
-        np.testing.assert_allclose(found, wanted, atol=5.1e-5)
-
-
-def test_how_the_force_rises_with_other_gap_resistances() -> None:
-    """Where our rise of 72 % differs from the paper's 80 %, ours is held; `test_paper` has the other claims."""
-    low, resistance = table1_circuit().replace({"Vdrive.amplitude": figures.U0_FORCE}), figures.variations()[2]
-    assert resistance.values == (0.5, 1.0, 2.0, 7.0)
-    forces = np.array([fs.phasor(resistance.apply(low, r), (100.0, 10000.0)).f_el_mean for r in resistance.values])
-    np.testing.assert_allclose(forces[:, 1] / forces[:, 0], [3.06, 1.72, 1.21, 0.91], atol=5e-3)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Fits find true values again, with intervals that cover them, say what data cannot tell, and refuse bad data."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import runpy
@@ -17,7 +15,7 @@ from commands import Command
 from fingerspice.base.errors import InputError
 from fingerspice.studies.fit import circuitfit
 from fingerspice.studies.fit.fitting import Fitted, followed
-from scenes import CIRCUITS, cases, covers, shipped, table1, table1_deck
+from scenes import CIRCUITS, cases, covers, listed, shipped, table1, table1_deck
 
 TRUE = {"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6, "Xgap.alpha": 48.0}
 Data = dict[str, np.ndarray]
@@ -174,61 +172,40 @@ def by(**groups: object) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("data", "options", "text"),
     [
-        ({"f_el_mean": [1e-2, 2e-2]}, {"parameters": ["Xgap.dd"]}, "nearest: 'Xgap.d'"),
-        (ONE, {"parameters": ["Xgap.d", "Xgap.r"]}, "1 data cannot tell 2 parameters"),
-        ({"f_el_mean": [1e-2, np.nan]}, {}, "is nan in row 1"),
-        ({"f_el_mean": [1e-2, 2e-2], "Vdrive.amplitude": [1.0, 2.0, 3.0]}, {}, "allowed: as many"),
-        ({"Vdrive.amplitude": [1.0, 2.0]}, {}, "no measured column"),
-        (ONE | {"Xgap.d": [3e-6]}, {}, "is a condition of the data"),
-        (ONE | {"sigma": [0.0]}, {}, "smallest sigma is 0"),
-        ({"f_el_mean": [1e-2, -2e-2]}, {}, r"f_el_mean is -0\.02 N in row 1; allowed: 0 or more, as the el"),
-        ({"friction_mean": [-0.5, 0.5]}, {}, r"friction_mean is -0\.5 in row 0; allowed: 0 or more"),
-        ({"t": [0.0, 0.5], "f_t": [1e-3, -2e-3]}, {}, r"f_t is -0\.0005 N on average; allowed: 0 or more"),
-        ({"frequency": [1.0, 2.0], "impedance": [1e6, 0.0]}, {}, "is 0 ohm in row 1; allowed: magnitudes above 0"),
-        ({"t": [1.0, 0.5], "f_el": [0.0, 0.0]}, {}, "rising times"),
-        ([1.0, 2.0], {}, "data is a list"),
-        (ONE, {"parameters": "Xgap.d"}, "a sequence of paths"),
-        (ONE, {"parameters": ["Vdrive"]}, "'Vdrive' is no parameter that takes numbers; allowed: a path"),
-        (ONE, {"parameters": ["Xgap.tau"]}, "fitted in its logarithm"),
-        (ONE | {"Xskin.f": [100.0]}, {"skin": "follow", "starts": 1}, r"skin='follow' and Xskin\.f are both given"),
-        (ONE, {"charge_law": "moving"}, "charge_law is 'moving'; allowed: 'local' or 'mobile'"),
-        (ONE | {"voltage": [100.0]}, {}, "a column 'voltage', which is no param.*, such as X"),
-        ({"frequency": [1e3], "impedance": [-1e5]}, {}, "magnitudes above 0"),
-        (ONE | {"frequency": [1e3], "impedance_phase": [-30.0]}, {}, "beside impedance"),
-        ({"frequency": [1e3], "impedance": [1j], "impedance_phase": [1.0]}, {},
+    *listed("fits"),
+    (ONE, {"parameters": ["Xgap.d", "Xgap.r"]}, "1 data cannot tell 2 parameters"),
+    ({"f_el_mean": [1e-2, np.nan]}, {}, "is nan in row 1"),
+    (ONE | {"Xgap.d": [3e-6]}, {}, "is a condition of the data"),
+    (ONE | {"sigma": [0.0]}, {}, "smallest sigma is 0"),
+    (ONE, {"parameters": "Xgap.d"}, "a sequence of paths"),
+    (ONE, {"parameters": ["Vdrive"]}, "'Vdrive' is no parameter that takes numbers; allowed: a path"),
+    (ONE, {"parameters": ["Xgap.tau"]}, "fitted in its logarithm"),
+    (ONE | {"Xskin.f": [100.0]}, {"skin": "follow", "starts": 1}, r"skin='follow' and Xskin\.f are both given"),
+    (ONE, {"charge_law": "moving"}, "charge_law is 'moving'; allowed: 'local' or 'mobile'"),
+    (ONE | {"voltage": [100.0]}, {}, "a column 'voltage', which is no param.*, such as X"),
+    (ONE | {"frequency": [1e3], "impedance_phase": [-30.0]}, {}, "beside impedance"),
+    ({"frequency": [1e3], "impedance": [1j], "impedance_phase": [1.0]}, {},
          "impedance is complex, and impedance_phase is given"),
-        ({"frequency": [1e3, 2e3], "impedance": np.ma.array([1j, 2j], mask=[True, False])}, {},
+    ({"frequency": [1e3, 2e3], "impedance": np.ma.array([1j, 2j], mask=[True, False])}, {},
          "'impedance' is .*MaskedArray with masked values; allowed: numbers"),
-        ({"impedance": [1.0], "sigma": [1j]}, {}, "'sigma' is .*of complex numbers; allowed: numbers"),
-        ({"f_el_mean": [1e-2, 2e-2]}, {"parameters": ["Xgap.d", "xgap.D"]}, r"Xgap\.d is named twice; allowed: once"),
-        (ONE | {"Vdrive.amplitude": 1.0, "source.amplitude": 2.0}, {},
+    ({"impedance": [1.0], "sigma": [1j]}, {}, "'sigma' is .*of complex numbers; allowed: numbers"),
+    (ONE | {"Vdrive.amplitude": 1.0, "source.amplitude": 2.0}, {},
          r"two columns of Vdrive\.amplitude; allowed: one"),
-        ({"f_el_mean": [1e-2, 2e-2], "Vdrive.amplitude": [100.0]}, {},
-         r"'Vdrive.amplitude' has the shape \(1,\), others have 2 rows; allowed: as ma"),
-        (NAMED, by(hand=["Xgap.d"]), "no column 'hand', which groups names; they have"),
-        (NAMED, by(finger=["Xgap.r"]), r"groups names 'Xgap.r', which is not fitted; allowed: Xgap\.d"),
-        (NAMED, by(finger="Xgap.d"), "allowed: a mapping of a column"),
-        (NAMED, by(finger=["Xgap.d"], hand=["Xgap.d"]), "allowed: a mapping of a column"),
-        (NAMED, by(**{"Xgap.fn": ["Xgap.d"]}), "the column 'Xgap.fn', which is a parameter"),
-        (NAMED, {"groups": ["Xgap.d"]}, "allowed: a mapping of a column"),
-        ({"t": [0.0, 1e-3], "f_el": [0.1, 0.2], "g": [1, 2]}, by(g=["Xgap.d"]), "have times and groups"),
-        (ONE, {"bounds": {"Xgap.r": (1.0, 2.0)}}, r"bounds names Xgap\.r, which is not fitted"),
-        *((ONE, {"bounds": {"Xgap.d": pair}}, "allowed: two values with 0 <= low < high")
+    (NAMED, by(hand=["Xgap.d"]), "no column 'hand', which groups names; they have"),
+    (NAMED, by(finger=["Xgap.r"]), r"groups names 'Xgap.r', which is not fitted; allowed: Xgap\.d"),
+    (NAMED, by(finger="Xgap.d"), "allowed: a mapping of a column"),
+    (NAMED, by(finger=["Xgap.d"], hand=["Xgap.d"]), "allowed: a mapping of a column"),
+    (NAMED, by(**{"Xgap.fn": ["Xgap.d"]}), "the column 'Xgap.fn', which is a parameter"),
+    (NAMED, {"groups": ["Xgap.d"]}, "allowed: a mapping of a column"),
+    ({"t": [0.0, 1e-3], "f_el": [0.1, 0.2], "g": [1, 2]}, by(g=["Xgap.d"]), "have times and groups"),
+    (ONE, {"bounds": {"Xgap.r": (1.0, 2.0)}}, r"bounds names Xgap\.r, which is not fitted"),
+    *((ONE, {"bounds": {"Xgap.d": pair}}, "allowed: two values with 0 <= low < high")
           for pair in ((3e-6, 3e-6), (4e-6, 3e-6), (-1.0, 1.0), (np.nan, 1.0), (1.0,))),
-        (ONE, {"profiles": ["Xskin.d"]}, r"profiles names 'Xskin\.d', which is not fitted; allowed: True, or Xgap\.d"),
-        ("Vdrive.amplitude (A),f_el_mean (mN)\n100,1\n", {}, "of column 'Vdrive.amplitude' is 'A'; allowed: V"),
-        ("Vdrive.amplitude (V),f_el_mean (mN)\n100,1\n200,-4\n", {},
-         r"data\.csv': f_el_mean is -0\.004 N in row 2; allowed: 0 or more"),
-        ("frequency (Hz),impedance (kohm)\n100,-1\n", {}, "impedance is -1000 ohm in row 1; allowed: magnitudes abo"),
-        ("100,1\n200,4\n", {}, "has no header"),
-        ("time (ms),friction (mN)\n0,150\n1,160\n", {}, "the unit of column 'friction' is 'mN'; allowed: none"),
-        ("f_el_mean (N),Xgap.fn (N),Xgap.fn (N)\n0.01,0.5,0.6\n", {}, r"two columns 'Xgap\.fn'; allowed: one"),
-        ("finger,f_el_mean (N)\na,0.1\nb,0.2\n", {},
-         "no rows of numbers; allowed: numbers, and names in the column that groups"),
-        ("finger,f_el_mean (N)\na,0.1\n", by(hand=["Xgap.d"]),
+    (ONE, {"profiles": ["Xskin.d"]}, r"profiles names 'Xskin\.d', which is not fitted; allowed: True, or Xgap\.d"),
+    ("finger,f_el_mean (N)\na,0.1\n", by(hand=["Xgap.d"]),
          "has no column 'hand' in its header; it has finger, f_el_mean"),
-        ("finger,f_el_mean (N)\na,0.1\nb,0.2 oops\n", by(finger=["Xgap.d"]), "line 3"),
-    ],
+    ("finger,f_el_mean (N)\na,0.1\nb,0.2 oops\n", by(finger=["Xgap.d"]), "line 3"),
+],
 )  # fmt: skip
 def test_bad_requests_are_refused_in_one_line(
     circuit: fs.Circuit, tmp_path: Path, data: object, options: dict[str, object], text: str

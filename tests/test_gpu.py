@@ -1,7 +1,5 @@
 """`fs.batch` on a graphics card: its kernel in numba's simulator and compiled for a card, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Start of a run: IC=, .ic and the operating point, against ngspice 39, closed forms and conservation of charge."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -105,24 +103,6 @@ def test_random_networks_with_a_finger_start_as_in_ngspice(seed: int) -> None:
 
 
 # IC= of several capacitors ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_the_order_of_capacitors_does_not_matter_and_charge_is_conserved(turned: bool) -> None:
-    capacitors = ["C2 b 0 100p", "C1 b 0 1n IC=50"]
-    circuit = deck("V1 a 0 0", "R1 a b 10k", *capacitors[:: -1 if turned else 1], ".tran 1n 100n uic")
-    s = fs.simulate(circuit)
-    expected = 50.0 / 1.1 * np.exp(-s.t / 11e-6)
-    assert np.abs(s.node_voltages["b"] - expected).max() <= 1e-12 * 50.0
-
-
-def test_a_capacitor_with_ic_beside_others_that_ic_lines_give() -> None:
-    circuit = deck("V1 a 0 10", "R1 a b 10k", "C2 b 0 100p", "C1 b c 1n IC=50", "C3 c 0 1n", "R3 c 0 1meg",
-                   ".ic v(b)=20 v(c)=5", ".tran 1n 100n uic")  # fmt: skip
-    v = start(circuit)
-    # Charge of nodes b and c: 100 pF at 20 V, 1 nF at IC=, 1 nF at 5 V.
-    b, c = np.linalg.solve([[1.1, -1.0], [-1.0, 2.0]], [0.1 * 20.0 + 50.0, 5.0 - 50.0])
-    assert [v["b"], v["c"]] == pytest.approx([b, c], rel=1e-13)
 
 
 @every_law

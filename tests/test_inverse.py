@@ -1,7 +1,5 @@
 """The inverse drive: its source voltage produces the wanted force, and impossible requests get a clear message."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -15,7 +13,7 @@ from scipy.optimize import minimize
 import analytic as ref
 import fingerspice as fs
 from commands import Command
-from scenes import cases, dispersive_deck, shipped, table1
+from scenes import cases, dispersive_deck, listed, shipped, table1
 
 KINDS = {
     "stack": table1(), "dispersive": fs.parse_netlist(dispersive_deck()),
@@ -190,18 +188,7 @@ def test_design_writes_drive_prediction_and_picture(command: Command) -> None:
 
 @pytest.mark.parametrize(
     ("rows", "words", "said"),
-    [
-        ("0, 0.2\n0.1, 0.2\n", [], "no header"),
-        ("time; friction\n0; 0.2\n1; 0.2\n", [], "semicolons"),
-        ("time friction\n0 0,2\n1 0,2\n", [], "decimal comma"),
-        ("time,friction\n0,0.2\n1,nan\n", [], "line 3: column 'friction' is nan"),
-        ("time,friction\n1,0.2\n0,0.2\n", [], "line 3: the time 0 s follows 1 s"),
-        ("time,volts\n1,0.2\n2,0.2\n", [], "no column named force or friction"),
-        ("time,friction (V)\n1,0.2\n2,0.2\n", [], "the unit of column 'friction' is 'V'"),
-        ("time,friction\n0,0.2\n0.1,0.2\n0.2,0.2\n", ["--rate", "1k"], "its times are at 10 Hz"),
-        ("friction\n0.2\n0.2\n", [], "no column of times and no rate"),
-        ("time,friction\n0,0.1\n0.1,0.2\n", [], "reached by no voltage"),
-    ],
+    listed("wanted"),
 )
 def test_bad_tables_are_refused_in_one_sentence(command: Command, rows: str, words: list[str], said: str) -> None:
     Path("wanted.csv").write_text(rows)

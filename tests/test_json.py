@@ -1,7 +1,5 @@
 """`--json`: the same keys for every circuit and every outcome of a command, and nothing else on stdout."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import subprocess
@@ -15,7 +13,7 @@ import fingerspice as fs
 from commands import Command, Result
 from deck_edits import edited
 from fingerspice.cli.terminal import COMMON, FIGURES, OWN
-from scenes import CIRCUITS, shipped
+from scenes import CIRCUITS, listed, shipped
 
 DOCUMENT = (Path(__file__).parents[1] / "docs" / "json.md").read_text()
 FLAT = "t\nV1 a 0 SIN(0 10 100)\nXcoat a 0 area LAYER d=1u eps_r=2 r=1k\nVarea area 0 35\n.tran 100u 20m uic\n"
@@ -38,43 +36,7 @@ def answer(result: Result, command: str) -> Any:
 
 @pytest.mark.parametrize(
     ("line", "code"),
-    [
-        ("run pad.cir --no-plot", 0),
-        ("run flat.cir --no-plot", 0),
-        ("run rc.cir --no-plot", 0),
-        ("run two_fingers.cir --no-plot --stop 0.2m", 0),
-        ("run pad.cir --no-plot --charge-law mobile --set Xgap.d=10n", 1),
-        ("run pad.cir --set Xgap.d=-1", 2),
-        ("run none.cir", 2),
-        ("run pad.cir --plott", 2),
-        ("run", 2),
-        ("ac pad.cir --no-plot --sweep 'lin 2 100 200'", 0),
-        ("ac pad.cir --no-plot --sweep 'lin 1 100 100' --area coupled --rtol 1e-6", 0),
-        ("ac flat.cir --no-plot", 0),
-        ("ac pad.cir --no-plot --area -1", 2),
-        ("plan pad.cir", 0),
-        ("plan rc.cir", 0),
-        ("plan pad.cir --rtol 7", 2),
-        ("plan pad.cir --rtol small", 2),
-        ("compare pad.cir --no-plot --rtol 1e-6", 0),
-        ("compare pad.cir --no-plot --charge-law mobile --set Xgap.d=10n", 1),
-        ("compare pad.cir --source 'DC 5'", 2),
-        ("limits pad.cir --no-plot --points 3 --span 1.01 --set Xgap.d=100n --source 'SIN(0 200 5k)'", 0),
-        ("limits rc.cir --no-plot", 2),
-        ("design none.csv pad.cir", 2),
-        ("fit none.csv pad.cir --free Xgap.d", 2),
-        ("fit-contact none.csv pad.cir", 2),
-        ("export pad.cir -o x.cir", 0),
-        ("export pad.cir", 2),
-        ("figures --only 2", 0),
-        ("figures --only 9", 2),
-        ("run pad.cir --no-plot --finger moist --set 3M", 0),
-        ("sets", 0),
-        ("sets MOIST", 0),
-        ("sets moits", 2),
-        ("check none.zarr", 2),
-        ("rnu pad.cir", 2),
-    ],
+    listed("json"),
 )
 def test_the_keys_are_the_same_however_a_command_ends(command: Command, line: str, code: int) -> None:
     Path("flat.cir").write_text(FLAT)

@@ -3,8 +3,6 @@
 Nothing is timed: at these sizes an algorithm of quadratic cost would not finish.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Loading a NetCDF file restores the run to the last bit; another file is refused in one sentence."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import warnings
@@ -19,7 +17,7 @@ from scipy.io import wavfile
 import fingerspice as fs
 from fingerspice.results import runfile
 from fingerspice.results.runfile import GROUP
-from scenes import shipped, table1, table1_deck
+from scenes import listed, shipped, table1, table1_deck
 
 AM = fs.AM(150.0, 5000.0, 50.0) + 3.0 * fs.Square(1.0, 50.0, duty=0.25)
 
@@ -196,19 +194,7 @@ def changed(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
 
 @pytest.mark.parametrize(
     "part",
-    [
-        {"waveform": "__import__('os').system('true')"},
-        {"waveform": {"kind": "os.system", "command": "true"}},
-        {"waveform": {"kind": "Sine", "amplitude": {"array": 7}, "frequency": 1}},
-        {"waveform": {"kind": "Sine", "amplitude": 1, "frequency": 2, "mode": 3}},
-        {"waveform": {"kind": "Sum", "parts": 3}},
-        {"waveform": {"kind": "Samples", "values": {"array": "../x"}, "rate": 1}},
-        {"waveform": {"kind": "Function", "edges": 1, "series": 2, "breaks": 3, "repeat": 4}},
-        {"device": "system"},
-        {"values": {"value": "one"}},
-        {"nodes": 3},
-        {"nothing": 1},
-    ],
+    listed("run_files"),
 )
 def test_a_file_is_data_whoever_wrote_it(part: dict[str, object], tmp_path: Path) -> None:
     path = changed(tmp_path / "run.nc", lambda run: run["circuit"]["elements"][0].update(part))

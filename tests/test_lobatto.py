@@ -1,7 +1,5 @@
 """Tables of the exponential steps against integrals taken in many digits."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import mpmath as mp

@@ -1,7 +1,5 @@
 """The exponential method on stacks: events at which steps must end, and runs against `analytic.py`."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import Any
@@ -15,7 +13,7 @@ from fingerspice.numerics.lobatto import NODES
 from fingerspice.solve.collocation import Track
 from fingerspice.solve.problem import Tables, prepare
 from fingerspice.solve.runs import integrate
-from scenes import CIRCUITS, by_turns, cases, every_law, random_finger, random_waveform, table1
+from scenes import CIRCUITS, by_turns, cases, every_law, table1
 
 # Orders -----------------------------------------------------------------------------------------------------
 
@@ -121,29 +119,6 @@ def test_no_step_is_longer_than_the_decks_tmax(longest: float) -> None:
 
 
 # Against another method -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("seed", "law"), by_turns(range(cases(20, 8))))
-@pytest.mark.filterwarnings("ignore:the gap voltage reaches")
-def test_radau_agrees_within_what_the_two_say_of_their_errors(seed: int, law: str) -> None:
-    rng = np.random.default_rng([seed, 31])
-    f, volts = 10.0 ** rng.uniform(1.3, 4.0), rng.uniform(5.0, 200.0)
-    circuit, stop = random_finger(rng), 2.5 / f
-    t = np.sort(rng.uniform(0.0, stop, 150))
-    options = {
-        "sources": {"Vdrive": random_waveform(rng, f, volts)},
-        "t_eval": t,
-        "t_stop": stop,
-        "charge_law": law,
-        "rtol": 1e-11,
-    }
-    one = fs.simulate(circuit, **options)
-    two = fs.simulate(circuit, method="radau", **options)
-    assert one.method == "exponential"
-    # The figures of the force are means of two signs: one is never less sure than its voltage says.
-    assert np.abs(one.u_gap - two.u_gap).max() <= one.error.u_gap + two.error.u_gap
-    assert np.abs(one.f_el - two.f_el).max() <= one.error.f_el + two.error.f_el
-    assert np.abs(one.q_source - two.q_source).max() <= 1e-10 * np.abs(two.q_source).max()
 
 
 @pytest.mark.parametrize(("r_coat", "law"), by_turns(["1e-6", "1e-3", "1", "1k", "1e9", "1e15", "inf"]))

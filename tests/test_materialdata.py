@@ -1,7 +1,5 @@
 """Tables of measured materials: units in headers, and the likely slip that is named if the data fit no material."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import pytest
 import fingerspice as fs
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.studies.fit.materialfit import read_table
-from scenes import cases
+from scenes import cases, listed
 
 F = np.geomspace(*SKIN_BAND, 41)
 RHO, EPS = skin_resistivity(F), skin_permittivity(F)
@@ -56,16 +54,10 @@ ROWS = "\n1,2,3\n2,2,3\n3,2,3\n"
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        *listed("materials"),
         (f"f [furlong],rho,eps_r{ROWS}", r"the unit of column 'f \[furlong\]' is not known; allowed: Hz, rad/s, ohm m"),
         (f"f,rho [ohm],eps_r{ROWS}", r"the unit of column 'rho \[ohm\]' is not known"),
         (f"f,rho,sigma{ROWS}", "two columns are a resistivity by their names, f, rho, sigma; allowed: frequency"),
-        ("f,rho,eps\n1,2\n", "not three numbers"),
-        ("1,2,3\n2,x,3\n3,2,3\n", "row 2"),
-        ("1,2,3\n2,2,3\n", "three frequencies or more"),
-        ("1,2,3\n2,-2,3\n3,2,3\n", "resistivity in row 2 is -2"),
-        ("1,2,3\n2,1e-300,3\n3,2,3\n", "resistivity in row 2 is 1e-300"),
-        ("1,2,3\n1,2,3\n3,2,3\n", "frequencies"),
-        ("", "material data"),
         ('"' + "1" * 140_000, "field larger than field limit"),
     ],
 )

@@ -1,7 +1,5 @@
 """From decks to circuits: the meaning of devices, parameters and directives, ambiguous units, and warnings."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import warnings
@@ -13,7 +11,7 @@ import analytic as ref
 import fingerspice as fs
 from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import AcSweep, Tran
-from scenes import refused
+from scenes import listed
 
 
 def read(*changes: tuple[str, str]) -> fs.Circuit:
@@ -194,7 +192,7 @@ def test_a_title_that_swallows_the_source_is_named_with_the_error_it_causes() ->
     assert "the first line is the title, but 'Vdrive drive 0 SIN(0 200 100)' reads like a statement" in said
 
 
-BAD = [case for kind in ("devices", "values", "contact", "circuit", "directives", "sources") for case in refused(kind)]
+BAD = [case for kind in ("devices", "values", "contact", "circuit", "directives", "sources") for case in listed(kind)]
 
 
 @pytest.mark.parametrize(("change", "line", "parts"), BAD, ids=[change[1] for change, _, _ in BAD])
@@ -239,38 +237,12 @@ def test_a_source_is_changed_by_its_text() -> None:
 @pytest.mark.parametrize(
     ("path", "text", "said"),
     [
-        ("Xgap.fn", "0.5N", "Xgap.fn is '0.5N': SPICE reads N as nano (1e-9); write the number alone, in newton"),
-        ("Xgap.d", "3x", "Xgap.d: '3x' differs between simulators"),
-        ("Xgap.d", "2u5", "write 2.5u"),
-        ("Xgap.d", "3,5u", "Xgap.d: '3,5u' is not a number, its comma separates: write 3.5u"),
-        ("Xgap.d", "\u22123u", "Xgap.d: '\u22123u' is not a number, its minus is a typographic one: write -3u"),
-        ("Xgap.d", "", "Xgap.d: '' is not a number"),
-        ("Xgap.d", "3.5 um", "Xgap.d: '3.5 um' is not a number, its unit stands apart: write 3.5um"),
+        *listed("changes"),
         ("Xgap.d", fs.DC(1.0), "Xgap.d is DC(level=1.0); allowed: a number m, or text such as '3.5u'"),
-        ("Vdrive", "200 V", "source: 'V' stands apart; a unit joins its number, such as 5V"),
-        ("Xgap.d", "inf", "Xgap d is inf m; allowed: more than 0"),
-        ("Xgap.d", "-1u", "Xgap d is -1e-06 m; allowed: more than 0"),
-        ("Xgap.d", "{3u}", "'{3u}' is not a number"),
-        ("Xgap.d", (1e-6,), "Xgap.d is (1e-06,), a tuple; allowed: a number m, or text such as '3.5u'"),
         ("Xgap.d", np.array([1e-6]), "allowed: a number m, or text such as '3.5u'"),
         ("Xgap.d", None, "Xgap.d is None; allowed: a number m"),
         ("Xgap.mu", 1j, "Xgap.mu is 1j; allowed: a number, or text"),
-        ("Vdrive", "SQUARE(150)", "'SQUARE(150)': SQUARE needs 2 values"),
-        ("Vdrive", "SQARE(150 1k)", "did you mean 'square'"),
-        ("Vdrive.frequency", "1,5k", "Vdrive.frequency: '1,5k' is not a number, its comma separates: write 1.5k"),
-        ("Xgap.dd", 1e-6, "unknown parameter 'Xgap.dd'; nearest: 'Xgap.d'"),
-        ("Xgp.d", 1e-6, "unknown parameter 'Xgp.d'; nearest: 'Xgap.d'"),
-        ("Vdrive.amplitud", 1.0, "nearest: 'Vdrive.amplitude'"),
-        ("Vdrive.duty", 0.3, "unknown parameter 'Vdrive.duty'"),
-        ("Xgap", 1.0, "unknown parameter 'Xgap'"),
-        ("Xgap.d", 0.0, "Xgap d is 0 m; allowed: more than 0"),
-        ("Xgap.d", -3e-6, "Xgap d is -3e-06 m; allowed: more than 0"),
         ("Xgap.d", math.nan, "Xgap d is nan m; allowed: more than 0"),
-        ("Xcoat.r", 0.0, "Xcoat r is 0 ohm; allowed: more than 0 or inf"),
-        ("Xgap.mu", -0.1, "Xgap mu is -0.1; allowed: 0 or more"),
-        ("Xgap.n_exp", 0.4, "0 < m_exp < n_exp"),
-        ("Xgap.mu", 3.0, "Xgap has no contact"),
-        ("Vdrive.frequency", 0.0, "sine frequency is 0 Hz"),
     ],
 )
 def test_changes_that_are_no_values_are_one_sentence(path: str, text: object, said: str) -> None:

@@ -1,7 +1,5 @@
 """An executed notebook: results appear as tables and pictures without a magic line."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

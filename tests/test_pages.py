@@ -1,7 +1,5 @@
 """Display of results at Python's prompt, by print, and in a notebook."""
 
-from __future__ import annotations
-
 import html.parser
 from collections.abc import Callable
 from typing import Any

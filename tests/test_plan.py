@@ -1,7 +1,5 @@
 """The choice of the model: the right tier with its reason, and as accurate as the next heavier tier."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

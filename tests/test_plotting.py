@@ -19,7 +19,7 @@ from PIL import Image
 
 import fingerspice as fs
 from fingerspice.plots import drawing, traces
-from scenes import deck, shipped, table1
+from scenes import deck, listed, shipped, table1
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -232,15 +232,11 @@ def test_signals_that_are_asked_for_share_a_panel_with_their_like(sine: fs.Solut
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"signals": "fel"}, "unknown signal 'fel'; nearest: 'f_el'; allowed: u_source, "),
-        ({"signals": [3]}, "unknown signal 3"),
-        ({"signals": []}, "signals is empty"),
+        *listed("pictures"),
         *(
             ({"window": window}, r"window is .* s; allowed: ascending, with two outputs")
             for window in ((0.02, 0.01), (1.0, 2.0), (0.01, 0.010001))
         ),
-        ({"window": 3}, "window is 3; allowed: two times in s"),
-        ({"others": "x"}, "others is 'x'; allowed: Solutions"),
     ],
 )
 def test_what_a_picture_refuses(sine: fs.Solution, options: dict[str, Any], said: str) -> None:

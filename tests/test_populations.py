@@ -1,7 +1,5 @@
 """Sweeps over grids and populations, and Sobol indices, against functions whose indices are known."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ from scipy import stats
 import fingerspice as fs
 from commands import Command
 from fingerspice.studies.sweep import populations
-from scenes import CIRCUITS, shipped
+from scenes import CIRCUITS, listed, shipped
 
 
 @pytest.fixture(scope="module")
@@ -195,17 +193,7 @@ def test_the_command_writes_scenes_indices_and_a_picture(tmp_path: Path, command
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [
-        (("deck =", "dack ="), "unknown key 'dack'"),
-        (('"fingerpad.cir"', '"../other.cir"'), "same folder or below"),
-        (("lognormal = [3.5e-6, 0.1]", "lognormal = [3.5e-6]"), "median"),
-        (("lognormal", "gaussian"), "allowed: a number, or one of"),
-        (("uniform = [3e-4, 4e-4]", "uniform = [4e-4, 3e-4]"), "ascending"),
-        (("uniform = [3e-4, 4e-4]", "linear = [3e-4, 4e-4, inf]"), "a whole count"),
-        (("n = 32", "n = 33"), "power of two"),
-        (("n = 32", "n = "), "cannot be read as TOML"),
-        (('"Xgap.d"', '"Xgap.q"'), "Xgap"),
-    ],
+    listed("sweep_files"),
 )
 def test_bad_files_are_refused_in_one_sentence(
     tmp_path: Path, command: Command, change: tuple[str, str], said: str

@@ -1,7 +1,5 @@
 """Runs along recordings, against the independent reference and the `exponential` method; and their stated errors."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 
@@ -124,21 +122,6 @@ def test_stated_errors_cover_the_true_ones_and_what_was_asked_is_met() -> None:
     found = [x for n, some in drawn.items() for x in recording_errors.judge(recording_errors.draw(n, 300), some)]
     assert len(found) > 5 * len(drawn)
     recording_errors.assert_that_stated_errors_hold(found)
-
-
-@every_law
-def test_outputs_are_one_solution_wherever_they_are(law: str) -> None:
-    samples = fs.Samples(recording(), RATE, start=0.4 / RATE)
-    stop = 0.01734
-    every = np.sort(np.append(np.linspace(0.0, stop, 37), np.arange(100) / RATE))
-    whole = follow(samples, stop, t_eval=every, charge_law=law, rtol=1e-6)
-    for part in (slice(0, None, 3), slice(30, 60), slice(every.size - 1, None)):
-        some = follow(samples, stop, t_eval=every[part], charge_law=law, rtol=1e-6)
-        for name in ("u_gap", "q_source", "i_source"):
-            # Samples are written by the block and other times one by one: alike but for rounding.
-            given, expected = getattr(some, name), getattr(whole, name)
-            assert np.abs(given - expected[part]).max() <= 1e-11 * np.abs(expected).max()
-    assert whole.method == "relaxation"
 
 
 def test_a_run_goes_on_where_another_has_ended() -> None:

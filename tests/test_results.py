@@ -1,7 +1,5 @@
 """Folder and names of a command's results, and files that are never replaced without a message."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

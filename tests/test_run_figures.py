@@ -1,7 +1,5 @@
 """Figures of a run, in its summary, printed and as attributes: integrals over its steps, whatever its outputs are."""
 
-from __future__ import annotations
-
 import math
 import pickle
 import re

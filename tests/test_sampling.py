@@ -1,7 +1,5 @@
 """A user's function as a source: declared breaks are exact, undeclared ones are found and warned about."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from typing import Any
@@ -268,22 +266,6 @@ def test_a_run_names_the_time_and_the_source_of_a_nan_and_keeps_what_came_before
     assert not partial.success
     assert 0.0029 < partial.t[-1] <= 0.003
     assert np.isfinite(partial.u_gap).all()
-
-
-def test_a_function_that_is_rough_is_followed_as_far_as_it_goes_and_says_so() -> None:
-    rng = np.random.default_rng(3)
-    table = {}
-
-    def rough(t: float) -> float:
-        # Its own rounding: a part in 1e11, anew at every time.
-        return 200.0 * math.sin(600.0 * t) * (1.0 + 1e-11 * table.setdefault(t, rng.uniform(-1.0, 1.0)))
-
-    how = {"t_stop": 0.004}
-    run = fs.simulate(table1(), sources=rough, rtol=1e-8, **how)
-    smooth = fs.simulate(table1(), sources=lambda t: 200.0 * math.sin(600.0 * t), rtol=1e-8, **how)
-    assert np.abs(run.u_gap - smooth.u_gap).max() <= run.error.u_gap
-    with pytest.raises(fs.SolveError, match="the source function itself is rough by"):
-        fs.simulate(table1(), sources=rough, rtol=1e-12, **how)
 
 
 def test_a_function_that_fades_below_the_smallest_numbers_is_not_followed_there() -> None:

@@ -1,7 +1,5 @@
 """Sensitivities of a run by parameters, against differences of independent solutions, and what is refused."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Named sets of parameters: their files, what they make of a circuit, and what is cited for a run."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json
@@ -19,7 +17,7 @@ from commands import Command
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.scene import EXAMPLES
 from fingerspice.sets.parameters import DATA, ELEMENTS, KINDS, WAVEFORMS, keys_in, references, tables
-from scenes import shipped
+from scenes import listed, shipped
 
 ROOT = Path(__file__).parents[1]
 CIRCUITS = ROOT / "circuits"
@@ -246,16 +244,7 @@ def test_a_dispersive_skin_has_no_f_and_takes_its_thickness() -> None:
 
 @pytest.mark.parametrize(
     ("given", "said"),
-    [
-        (("moits",), "unknown set 'moits'; nearest: 'moist'"),
-        (("Forsbach",), "nearest: 'Forsbach2021'"),
-        (("xyz",), "unknown set 'xyz'; allowed: Forsbach2021, "),
-        (("",), "unknown set ''; allowed: Forsbach2021, "),
-        ((3,), "parameters is given 3, a int; allowed: the name of a set"),
-        (("3m", "finger"), "the set '3M' is a coating, not a finger; allowed: dry, moist, normal, "),
-        (("moits", "finger"), "unknown finger set 'moits'; nearest: 'moist'"),
-        (("moist", "toe"), "kind is 'toe'; allowed: scene, finger, load, coating, drive"),
-    ],
+    listed("sets"),
 )
 def test_an_unknown_set_or_one_of_another_kind_is_refused_with_what_is_allowed(given: tuple, said: str) -> None:
     with pytest.raises(fs.InputError, match=re.escape(said)):

@@ -1,7 +1,5 @@
 """The result of a run: its output rows, its arrays and copies of it, its figures, and its files."""
 
-from __future__ import annotations
-
 import copy
 import csv
 import dataclasses

@@ -1,7 +1,5 @@
 """Recordings and tables from files: reading by decks, the command line and Python, and refused files."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import struct
@@ -19,7 +17,7 @@ from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.netlist import reader
 from fingerspice.waveforms import files
-from scenes import refused, table1_deck
+from scenes import listed, table1_deck
 
 GUID = bytes.fromhex("800000aa00389b71")
 
@@ -345,7 +343,7 @@ def test_a_file_of_a_pwl_alternates_times_and_values(text: str, folder: Path) ->
     assert "the time 0.0005 s follows 0.001 s" in refusal(source, "PWL FILE=line.txt")
 
 
-@pytest.mark.parametrize(("text", "given", "said"), refused("tables"), ids=[said for *_, said in refused("tables")])
+@pytest.mark.parametrize(("text", "given", "said"), listed("tables"), ids=[said for *_, said in listed("tables")])
 def test_what_is_no_table_is_refused_with_its_line(
     text: str, given: dict[str, object], said: str, in_folder: None
 ) -> None:
@@ -493,7 +491,7 @@ def test_decks_name_files_beside_them(folder: Path) -> None:
     same(part, fs.Samples.from_wav(stereo, 7.0, 0))
 
 
-@pytest.mark.parametrize(("text", "said"), refused("files"), ids=[text for text, _ in refused("files")])
+@pytest.mark.parametrize(("text", "said"), listed("files"), ids=[text for text, _ in listed("files")])
 def test_files_that_a_deck_may_not_or_cannot_read_are_refused_with_its_line(text: str, said: str, folder: Path) -> None:
     Path("decks/link.wav").symlink_to(folder / "outside.wav")
     message = refusal(source, text)

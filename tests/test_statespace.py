@@ -1,19 +1,16 @@
 """State space of series stacks, written in any order and direction, against a dense formulation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import mpmath as mp
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
-from scenes import deck, table1
+from scenes import deck
 
 SEARCH = settings(max_examples=50, derandomize=True, deadline=None)
 # Rates twelve decades apart, squared in the characteristic polynomial, with room to spare.
@@ -114,26 +111,6 @@ def test_rates_and_voltages_have_their_digits_though_rates_are_decades_apart_or_
     np.testing.assert_allclose(solution.u_layer * signs, np.array(voltages)[:, back], rtol=0, atol=200.0 * 1e-12)
 
 
-@pytest.mark.parametrize("n", range(1, 9))
-def test_n_layers_have_n_voltages_and_n_minus_one_live_states(n: int) -> None:
-    layers = [Slice(1e-6 * (i + 1), 2.0 + i, r=1e6) for i in range(n)]
-    circuit = chain(layers, [False] * n, list(range(n + 2)), "Vdrive n0 0 SIN(0 10 1k)")
-    solution = fs.simulate(circuit, rtol=1e-6)
-    assert solution.u_layer.shape == (solution.t.size, n)
-    assert solution.state.y.size == n, "n - 1 voltages and the charge"
-    np.testing.assert_allclose(solution.u_layer.sum(1), solution.u_source, rtol=0, atol=1e-12 * 10.0)
-
-
-@pytest.mark.parametrize("n", [1, 3, 8])
-def test_without_resistors_the_voltages_split_by_the_inverse_capacitances_for_ever(n: int) -> None:
-    layers = [Slice(1e-6 * (i + 1), 2.0 + i) for i in range(n)]
-    circuit = chain(layers, [False] * n, list(range(n + 2)), "Vdrive n0 0 SQUARE(10 1k)")
-    solution = fs.simulate(circuit)
-    share = np.array([1.0 / x.c for x in layers]) / sum(1.0 / x.c for x in layers)
-    np.testing.assert_allclose(solution.u_layer, np.outer(solution.u_source, share), rtol=0, atol=1e-14 * 10.0)
-    assert all(rate == 0.0 for rate in fs.plan(circuit).rates)
-
-
 # Sources ----------------------------------------------------------------------------------------------------
 
 
@@ -175,14 +152,6 @@ def test_every_layer_spans_its_own_nodes_and_turning_one_turns_its_sign(made, ba
         sign = (-1.0 if turned[i] else 1.0) * (-1.0 if backwards else 1.0)
         mine, reference = (s.u_layer[:, s.layers.index(f"X{i}")] for s in (a, b))
         np.testing.assert_allclose(sign * mine, reference, rtol=0, atol=2e-7)
-
-
-# Table 1 ----------------------------------------------------------------------------------------------------
-
-
-def test_an_area_fixed_by_the_gap_or_by_a_source_is_the_stacks_area() -> None:
-    assert build_stack(table1(gap={"a_fix": 30})).area_given == pytest.approx(30e-6, rel=1e-15)
-    assert build_stack(table1(gap={"a_fix": 0})).area_given is None
 
 
 def test_a_given_area_that_is_replaced_counts_after_the_circuit_has_run() -> None:

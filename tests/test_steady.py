@@ -1,7 +1,5 @@
 """Periodic states by Newton's method: the state, its defect and its stability."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from functools import lru_cache
@@ -250,27 +248,6 @@ def test_the_multipliers_are_the_eigenvalues_of_the_map_of_one_period(law: str) 
 
 
 # Starts and neighbours --------------------------------------------------------------------------------------
-
-
-@every_law
-@pytest.mark.parametrize("name", ["offset", "duty", "AM"])
-def test_a_run_started_from_the_periodic_state_is_it(name: str, law: str) -> None:
-    waveform, _ = SCENES[name]
-    circuit = table1().replace({"Vdrive": waveform})
-    period = waveform.period
-    state = fs.steady_state(circuit, charge_law=law, rtol=1e-10)
-    # Off the jumps: three times twenty outputs.
-    t = (np.arange(60) + 0.37) / 20.0 * period
-    run = fs.simulate(circuit, start="periodic", t_eval=t, t_stop=3.0 * period, charge_law=law, rtol=1e-10)
-    assert run.plan.start == run.start == "periodic"
-    peak = np.abs(run.u_gap).max()
-    first, second, third = (run.u_layer[i : i + 20] for i in (0, 20, 40))
-    assert np.abs(second - first).max() <= 3e-10 * peak
-    assert np.abs(third - first).max() <= 3e-10 * peak
-    kept = alone(state.solution.t) & (state.solution.t < state.solution.t[-1])
-    t = state.solution.t[kept]
-    same = fs.simulate(circuit, start="periodic", t_eval=t, t_stop=period, charge_law=law, rtol=1e-10)
-    assert np.abs(same.u_layer - state.solution.u_layer[kept]).max() <= 2e-10 * peak
 
 
 @pytest.mark.parametrize("start", [0.0, 0.02], ids=["before it settles", "after"])

@@ -1,7 +1,5 @@
 """Runs chunk by chunk: bitwise equal to the whole run, in constant memory, in a store that survives a crash."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle
@@ -25,7 +23,7 @@ from fingerspice.solve import streaming
 from fingerspice.solve.recordings import block as pieces
 from fingerspice.waveforms import samples
 from processes import forked, no_room_here
-from scenes import cases, dispersive_deck, every_law, shipped, table1, table1_deck
+from scenes import cases, dispersive_deck, every_law, listed, shipped, table1, table1_deck
 from test_source_files import wav as wav_bytes
 
 RATE = 48_000.0
@@ -185,13 +183,7 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"chunk": 0.0}, "chunk is 0 s; allowed: a number of s, > 0"),
-        ({"chunk": "1"}, "chunk is '1'; allowed: a number of s, > 0"),
-        ({"count": 0}, "count is 0; allowed: a whole number, 1 or more"),
-        ({"count": 3, "chunk": 1.0}, "count is given beside chunk; allowed: one of them"),
-        ({"step": -1.0}, "step is -1 s; allowed: a number of s, > 0"),
-        ({"method": "euler"}, "unknown method 'euler'"),
-        ({"rtol": 1.0}, "rtol is 1.0; allowed"),
+        *listed("streams"),
         ({"count": 10**10, "step": 1e-12, "t_stop": 1.0}, "outputs with"),
     ],
 )

@@ -1,7 +1,5 @@
 """Sweeps: their drive, the frequency of the skin's data, networks against hand-computed impedances, ngspice exports."""
 
-from __future__ import annotations
-
 import cmath
 import json
 import math

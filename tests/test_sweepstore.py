@@ -1,7 +1,5 @@
 """Sweeps in a store: the same bytes whoever runs the chunks, and however often they are killed."""
 
-from __future__ import annotations
-
 import json
 import logging
 import multiprocessing
@@ -28,7 +26,7 @@ from commands import Command, tree
 from fingerspice.studies.sweep import chunks
 from fingerspice.studies.sweep.populations import Draws, Plan
 from processes import forked, no_room_here
-from scenes import CIRCUITS, cases, shipped
+from scenes import CIRCUITS, cases, listed, shipped
 
 # How often a whole program, and a worker, is killed; each takes seconds to start.
 KILLS, KILLS_OF_WORKERS = cases(20, 2), cases(20, 1)
@@ -522,13 +520,7 @@ def test_the_command_fills_a_store_shard_by_shard(file: Path, command: Command) 
 
 @pytest.mark.parametrize(
     ("words", "said"),
-    [
-        (("--workers", "2"), "--workers is given without --store"),
-        (("--shard", "1/2"), "--shard is given without --store"),
-        (("--store", "o.zarr", "--shard", "1-2"), "two whole numbers such as 1/8"),
-        (("--store", "o.zarr", "--shard", "3/2"), "shard is (3, 2)"),
-        (("--store", "fingers.toml"), "is no store of a sweep"),
-    ],
+    listed("sweep_commands"),
 )
 def test_bad_commands_are_refused_in_one_sentence(
     file: Path, command: Command, words: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch

@@ -1,7 +1,5 @@
 """PWL sources with dense points at uneven times: their results and the errors stated."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

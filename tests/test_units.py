@@ -1,7 +1,5 @@
 """SPICE numbers and engineering notation."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 

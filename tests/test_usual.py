@@ -1,7 +1,5 @@
 """Values that are legal but unusual: warnings from Python and from the command line, and values without a warning."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings
