@@ -22,27 +22,18 @@ from fingerspice.engine.collocation import readout
 from fingerspice.solve.problem import MOST_BYTES
 from fingerspice.waveforms import periodic
 from processes import ended, start
-from scenes import CIRCUITS, shipped, table1
+from scenes import CIRCUITS, listed, shipped, table1
 from waveform_cases import CASES, Case
 
 GIB = 2**30
 #: What the engine, compiled, and the libraries take; not a tenth of what these requests would.
 ROOM = 4 * GIB
 SOURCE = "SIN(0 200 100)"
-#: A change of the deck, the command, and what is said.
-ENDLESS = {
-    "picoseconds": ("PULSE(0 200 0 1e-13 1e-13 8e-13 2e-12)", ".tran 10u 5m uic", "1.25e+10 breakpoints of its source"),
-    "many squares": ("SQUARE(200 1e9)", ".tran 1 10 uic", "4e+10 breakpoints of its source; allowed: at most 4e+09"),
-    "listed": ("SQUARE(200 10meg)", ".tran 1m 1 uic", "5e+07 breakpoints from 0 s to 1 s; allowed: at most 2e+07"),
-    "outputs": (SOURCE, ".tran 10n 1 uic", "one of 1e+08 outputs with 19 signals, 15.2 GB; allowed: at most 2 GB"),
-    "frequency": ("SIN(0 200 1e30)", ".tran 10u 5m uic", "5e+27 periods or time constants"),
-    "time": (SOURCE, ".tran 1e11 1e12 uic", "1e+14 periods or time constants of its source; allowed: at most 1e+10"),
-    "decay": ("EXP(0 200 0 1e-15 1m 1e-15)", ".tran 10u 50m uic", "5e+13 periods or time constants"),
-}
 
 
 def test_a_request_without_an_end_is_refused_in_little_memory(tmp_path: Path) -> None:
-    for name, (source, tran, _) in ENDLESS.items():
+    endless = listed("endless")
+    for name, source, tran, _ in endless:
         text = edited((SOURCE, source), (".tran 10u 50m uic", tran))
         (tmp_path / f"{name}.cir").write_text(text)
     code = (
@@ -51,9 +42,10 @@ def test_a_request_without_an_end_is_refused_in_little_memory(tmp_path: Path) ->
         "        print(error)\n    else:\n        print('it ran')\n"
     )
     limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM))  # noqa: E731
-    done, lines, out = ended(start(tmp_path, *ENDLESS, entry=[sys.executable, "-c", code], preexec_fn=limit))
+    names = [name for name, *_ in endless]
+    done, lines, out = ended(start(tmp_path, *names, entry=[sys.executable, "-c", code], preexec_fn=limit))
     assert (done, lines) == (0, [])
-    for said, (_, _, expected) in zip(out.splitlines(), ENDLESS.values(), strict=True):
+    for said, (*_, expected) in zip(out.splitlines(), endless, strict=True):
         assert expected in said
 
 

@@ -213,18 +213,6 @@ def test_no_source_of_a_shipped_deck_misses_its_run() -> None:
         assert list(course_warnings(circuit, 0.0, circuit.tran.stop, by_deck=True)) == []  # type: ignore[union-attr]
 
 
-def test_a_recording_that_the_decks_own_end_cuts_off_is_told() -> None:
-    circuit = table1("PWL(" + " ".join(f"{i * 1e-5:g} {i % 7}" for i in range(150)) + ")", tran="10u 1m uic")
-    said = "the recording ends at 0.00149 s, and the run at the deck's TSTOP = 0.001 s; --stop 0.00149 takes all of it"
-    with pytest.warns(fs.FingerspiceWarning, match=re.escape(said)):
-        run = fs.simulate(circuit, rtol=1e-6)
-    assert any(said in text for text in run.warnings)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*the recording ends")
-        warnings.filterwarnings("ignore", message=".* has no fundamental")
-        fs.simulate(circuit, rtol=1e-6, t_stop=1e-3)
-
-
 @pytest.mark.parametrize(("times", "said"), [
     ([0.0, 20.0, 40.0], "; its times are probably in ms, and count as s here"),
     ([0.0, 4e4], "; its times are probably in ms or us, and count as s here"),

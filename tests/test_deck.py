@@ -201,33 +201,6 @@ def test_work_grows_with_the_deck_and_not_faster() -> None:
 
 # Names of parameters in nested calls mean what they mean in ngspice 39, or are refused
 
-INNER = ".subckt inner a b\nR1 a b {w}\n.ends\n"
-MID = ".subckt mid a b\nX1 a b inner\n.ends\n"
-OUTER = ".subckt outer a b w=5\nX1 a b inner\n.ends\nX1 a 0 outer"
-OWN = ".subckt outer a b\n.param w=5\nX1 a b inner\n.ends\nX1 a 0 outer"
-CASES = {
-    "the caller's default": f".param w=7\n{INNER}{OUTER}",
-    "the caller's given value": f".param w=7\n{INNER}{OUTER} w=3",
-    "the caller's .param": f".param w=7\n{INNER}{OWN}",
-    "the caller's caller's": f".param w=7\n{INNER}{MID}{OUTER.replace('b inner', 'b mid')}",
-    "nobody's but the caller's": f"{INNER}{OWN}",
-    "the deck's from another call": f".param w=7\n{INNER}{OUTER.replace('0 outer', '0 inner')}",
-    "a bare name": f".param w=7\n{INNER.replace('{w}', 'w')}{OUTER}",
-    "a default": f".param w=7\n.subckt inner a b z={{w+1}}\nR1 a b {{z}}\n.ends\n{OUTER}",
-    "a .param inside": f".param w=7\n.subckt inner a b\n.param z={{w}}\nR1 a b {{z}}\n.ends\n{OUTER}",
-    "the deck's own formula": f".param w=7 z={{2*w}}\n{INNER.replace('{w}', '{z}')}{OUTER}",
-    "a name handed on": (
-        f".param w=7\n.subckt inner a b w=4\nR1 a b {{w}}\n.ends\n{OUTER.replace('b inner', 'b inner w={2*w}')}"
-    ),
-    "a definition inside, called from beside it": (
-        f".param w=7\n.subckt outer a b w=5\n{INNER}{MID.replace('a b', 'a b w=9', 1)}X1 a b mid\n.ends\nX1 a 0 outer"
-    ),
-    "what two callers hand down": (
-        ".subckt inner a b\n.param y={w*2}\nR1 a b {y}\n.ends\n.subckt outer a b\n.param w={q}\nX1 a b inner\n.ends\n"
-        ".subckt top a b q=3\nX1 a b outer\n.ends\nX1 a 0 top"
-    ),
-}
-
 
 def theirs(body: str, folder: Path) -> float:
     """The resistance between a and 0 that ngspice finds, ohm."""
@@ -246,9 +219,9 @@ def ours(body: str) -> float:
     return float(value.value)  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_an_undefined_name_is_the_callers_as_in_ngspice(name: str, tmp_path: Path) -> None:
-    assert ours(CASES[name]) == pytest.approx(theirs(CASES[name], tmp_path), rel=1e-6)
+@pytest.mark.parametrize(("name", "body"), listed("callers"), ids=[name for name, _ in listed("callers")])
+def test_an_undefined_name_is_the_callers_as_in_ngspice(name: str, body: str, tmp_path: Path) -> None:
+    assert ours(body) == pytest.approx(theirs(body, tmp_path), rel=1e-6)
 
 
 def nest(rng: random.Random) -> str:

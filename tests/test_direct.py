@@ -305,24 +305,6 @@ def test_a_run_goes_on_from_where_another_stopped(tier: str, cut: float, start: 
     assert np.abs(second.q_source - whole.q_source[t >= cut]).max() <= 1e-12 * q
 
 
-@pytest.mark.parametrize("tier", CIRCUITS)
-def test_a_source_that_stops_being_finite_ends_the_run_there(tier: str) -> None:
-    def source(t: Any) -> Any:
-        return np.where(np.asarray(t) < 0.00412345, np.sin(2e3 * np.asarray(t)), np.nan)
-
-    circuit = deck("V1 in 0 1", *CIRCUITS[tier])
-    solution = fs.simulate(circuit, sources={"V1": source}, throw=False)
-    assert solution.method == tier
-    assert solution.status is fs.Status.SOURCE_NOT_FINITE
-    assert 0.0041 <= solution.t[-1] <= 0.0041235
-    assert solution.state.t == pytest.approx(0.00412345, abs=1e-9)
-    assert np.all(np.isfinite(solution.state.y))
-    assert solution.state.s_before[0] == pytest.approx(math.sin(2e3 * 0.00412345), abs=1e-5)
-    assert np.all(np.isfinite(solution.u_layer))
-    want = fs.simulate(circuit, sources={"V1": lambda t: np.sin(2e3 * np.asarray(t))})
-    np.testing.assert_allclose(solution.u_layer, want.u_layer[: solution.t.size], rtol=0, atol=1e-10)
-
-
 @every_law
 @pytest.mark.parametrize("at", [0.004, 0.00412345, 0.011], ids=["on an output", "between", "late"])
 @pytest.mark.parametrize("tier", [*CIRCUITS, "coupled"])
@@ -355,19 +337,6 @@ def test_a_source_that_is_never_finite_leaves_the_state_as_it_was(tier: str) -> 
 
 
 # The periodic state, and areas by their names -------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("f", "duty"), [(100.0, 0.5), (5000.0, 0.5), (500.0, 0.2)])
-@every_law
-def test_periodic_square_equals_the_matrix_exponential(f: float, duty: float, law: str) -> None:
-    circuit = table1(f"SQUARE(200 {f!r} {duty!r})", f)
-    solution = fs.steady_state(circuit, area=AREA, charge_law=law, rtol=1e-12, points=200).solution
-    # Both values at a jump have one time.
-    apart = np.append(False, np.diff(solution.t) > 0.0)
-    inside = apart & np.append(apart[1:], False)
-    phase = solution.t[inside] - solution.t[0]
-    expected = ref.square_frozen(f, 200.0, AREA, phase, layers=ref.table1_layers(f), duty=duty)
-    assert np.abs(solution.u_layer[inside] - expected).max() <= 1e-10 * 200.0
 
 
 def test_mean_and_frozen_areas_are_what_their_names_say() -> None:

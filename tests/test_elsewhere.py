@@ -16,7 +16,7 @@ from fingerspice.circuit.circuit import Tran
 from fingerspice.netlist.lexer import decimal_comma
 from fingerspice.netlist.reader import ELSEWHERE, LIBRARIES, library_text
 from ngspice_tools import call_ngspice, run_ngspice, with_max_step
-from scenes import DECKS
+from scenes import DECKS, listed
 
 TRAN = ".tran 10u 50m uic"
 OTHERS = sorted((DECKS / "others").glob("*.cir"))
@@ -177,13 +177,6 @@ def test_what_only_ngspice_or_ltspice_needs_is_not_worth_a_word(word: str, comma
     assert not command("run", "pad.cir", "--no-plot").lines
 
 
-DOUBTFUL = {
-    "V1 a 0 SIN(0 200 0,1)": "0,1 is two numbers, 0 and 1, for a comma separates; if it is a decimal comma write 0.1",
-    "X1 a b c LAYER d=3,5u eps_r=1": "write 3.5u", "X1 a b c LAYER d= 3,5um eps_r=1": "write 3.5um",
-    "V1 a 0 PULSE(0 5 0 1,5n 1n 1m 2m)": "write 1.5n", "V1 a 0 PULSE 0 5 0 -1,5n 1n": "write -1.5n",
-    ".tran 10u 0,05 uic": "write 0.05", ".param w=3,5u": "write 3.5u", "R1 a b 3,5k": "write 3.5k",
-    "R1 1 2 3,5k": "write 3.5k", "V1 a 0 DC 1,5": "write 1.5", ".ac dec 10 0,5 100k": "write 0.5",
-}  # fmt: skip
 RIGHT = [
     *("V1 a 0 SIN(0,200,100)", "V1 a 0 SIN(0, 200, 100)", "V1 a 0 PWL(0,0 1m,5 2m,0)", "V1 a 0 PWL(0 0, 1m 5, 2m 0)"),
     *("R1 1,2 10k", "R1 a b {max(1,2)*1k}", "R1 a b '1k*max(1,2)'", ".param w={min(3,5)}", ".ic v(a)=1, v(b)=2"),
@@ -191,7 +184,7 @@ RIGHT = [
 ]
 
 
-@pytest.mark.parametrize(("line", "said"), [*DOUBTFUL.items(), *((line, None) for line in RIGHT)])
+@pytest.mark.parametrize(("line", "said"), [*listed("commas"), *((line, None) for line in RIGHT)])
 def test_a_decimal_comma_is_named_and_a_comma_that_separates_is_right(line: str, said: str | None) -> None:
     found = decimal_comma(line)
     assert found is None if said is None else (found or "").endswith(said)

@@ -21,24 +21,10 @@ from scenes import cases, listed
 HERE = Where("deck.cir", 3, 10)
 NAMES = {"thick": 2.0, "Rho": 3.0, "if": 5.0}
 
-# Values tried in ngspice 39.
-NGSPICE = {
-    "2*3.5u": 7e-6, "1meg/2": 5e5, "-2^2": -4.0, "-2**2": -4.0, "2^-1": 0.5, "(-2)^2": 4.0, "pow(-2,3)": -8.0,
-    "log(10)": math.log(10.0), "log10(10)": 1.0, "int(-2.7)": -2.0, "nint(2.5)": 2.0, "sqr(3)": 9.0,
-    "arctan(1)": math.atan(1.0), "sgn(-3)": -1.0, "2*-3": -6.0, "--3": 3.0, "2-3-4": -5.0, "1>2?3:4": 4.0,
-    "(2>1)?3:4": 3.0, "2>1": 1.0, "1&&0": 0.0, "1==1": 1.0, "ternary_fcn(1,2,3)": 2.0, "max(1,2)": 2.0,
-}  # fmt: skip
-WITH_NAMES = {
-    "THICK * rho": 6.0, "if + 1": 6.0, "PI": math.pi, "2*e": 2 * math.e, "0 ? 1 : 0 ? 2 : 3": 3.0,
-    "1 ? (2 ? 3 : 4) : 5": 3.0, "max(1 > 2 ? 3 : 4, 1)": 4.0, "thick == 0 ? 1/0 : 7": 7.0, "(2^3)^2": 64.0,
-    "2^3*2^2": 32.0, "1<2 && 2<3 || 0": 1.0, "atan2(1, 1)": math.pi / 4, "-(-(-(-(1))))": 1.0,
-    "1+" * 900 + "1": 901.0, "(" * 25 + "-1" + ")" * 25: -1.0,
-}  # fmt: skip
 
-
-@pytest.mark.parametrize("text", [*NGSPICE, *WITH_NAMES])
-def test_arithmetic_means_what_ngspice_means_with_names_conditions_and_nesting(text: str) -> None:
-    assert evaluate(text, NAMES, HERE) == pytest.approx((NGSPICE | WITH_NAMES)[text], rel=1e-15)
+@pytest.mark.parametrize(("text", "value"), [*listed("arithmetic"), *listed("arithmetic_with_names")])
+def test_arithmetic_means_what_ngspice_means_with_names_conditions_and_nesting(text: str, value: float) -> None:
+    assert evaluate(text, NAMES, HERE) == pytest.approx(value, rel=1e-15)
 
 
 @pytest.mark.parametrize(("text", "column", "message"), [
@@ -171,32 +157,14 @@ def test_a_greek_mu_is_micro_with_a_warning_as_ngspice_ignores_it() -> None:
     assert circuit["C1"].values["value"] == 5e-6
 
 
-VALUES = {
-    "10": 10.0, ".5": 0.5, "5.": 5.0, "-3": -3.0, "+3": 3.0, "1e-6": 1e-6, "1E3": 1e3, "1e3k": 1e6, "1t": 1e12,
-    "1g": 1e9, "0.2meg": 2e5, "1MEG": 1e6, "1MegOhm": 1e6, "200k": 2e5, "1m": 1e-3, "1M": 1e-3, "1mil": 25.4e-6,
-    "350u": 350e-6, "1µ": 1e-6, "1μF": 1e-6, "10uF": 1e-5, "1n": 1e-9, "1p": 1e-12, "1f": 1e-15, "1F": 1e-15,
-    "5V": 5.0, "200Hz": 200.0, "1Ohm": 1.0, "1kΩ": 1e3, "90deg": 90.0, "0e-999": 0.0,
-}  # fmt: skip
-REFUSED = {
-    "2k7": "write 2.7k", "4R7": "write 4.7", "1x": "write 1meg", "1a": "write 1", "1A": "write 1", "1milli": "write 1m",
-    "5micro": "write 5u", "5meter": "write 5", "1q": "neither a scale", "1e": "neither a scale", "1e999": "larger than",
-    "1e308k": "larger than", "1e-999": "smaller than", "9" * 500: "characters",
-    **dict.fromkeys(("", ".", "-", "inf", "nan", "1_0", " 1", "1 ", "1.2.3", "0x10", "١", "1,2"), "is not a number"),
-}  # fmt: skip
-WRITTEN = {
-    3.5e-6: "3.5 um", 2e5: "200 km", 0.0: "0 m", 999.96: "1 km", 999.94: "999.9 m", -1500.0: "-1.5 km",
-    1e-20: "1e-20 m", 1e17: "1e+17 m", math.inf: "inf m", -math.inf: "-inf m", math.nan: "nan m",
-}  # fmt: skip
-
-
 def test_numbers_have_the_value_that_spice_gives_them_and_a_suffix_costs_no_rounding() -> None:
-    assert {text: parse_number(text) for text in VALUES} == VALUES
+    assert [[text, parse_number(text)] for text, _ in listed("numbers")] == listed("numbers")
     assert parse_number("3.5u") == 3.5e-6
     assert [i for i in range(1000) if parse_number(f"{i}.1u") != float(f"{i}.1e-6")] == []
 
 
 def test_what_is_no_number_or_read_differently_elsewhere_is_refused() -> None:
-    for text, hint in REFUSED.items():
+    for text, hint in listed("no_numbers"):
         with pytest.raises(ValueError, match=hint):
             parse_number(text)
 
@@ -213,7 +181,7 @@ def test_a_capital_m_is_suspected_of_meaning_mega_and_a_unit_that_spice_takes_fo
 
 
 def test_engineering_notation_which_without_a_unit_ends_in_the_prefix() -> None:
-    assert {value: format_si(value, "m") for value in WRITTEN} == WRITTEN
+    assert [format_si(value, "m") for value, _ in listed("written")] == [text for _, text in listed("written")]
     assert [format_si(-0.0, "m"), format_si(2e5, ""), format_si(1.0, "")] == ["0 m", "200 k", "1"]
     assert format_si(123.4, "V", digits=2) == "120 V"
 

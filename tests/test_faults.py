@@ -290,18 +290,6 @@ def test_a_folder_in_the_place_of_a_picture_is_refused_before_the_run(command: C
     assert [p.name for p in Path("out").iterdir()] == [picture]
 
 
-def test_a_deck_named_as_the_picture_and_a_folder_that_takes_no_files_are_refused(command: Command) -> None:
-    # Not even root may make a file there.
-    (line,) = command("run", "pad.cir", "--out", "/proc/self").lines
-    assert line.startswith("fingerspice: cannot write /proc/self/pad.nc: ")
-    assert line.endswith("; allowed: a folder that can be written")
-    Path("pad.cir").rename("pad.png")
-    result = command("run", "pad.png", "--out", ".")
-    assert result.code == 2
-    assert result.lines == ["fingerspice: cannot write pad.png: it is the deck itself; allowed: another name or folder"]
-    assert Path("pad.png").read_text() == edited(QUICK)
-
-
 def test_a_link_is_followed_a_pipe_written_as_it_is_and_a_file_gets_the_usual_permissions(tmp_path: Path) -> None:
     def write(path: Path) -> Path:
         return write_aside(path, lambda p: p.write_text("new"))

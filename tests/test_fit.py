@@ -11,7 +11,6 @@ import pytest
 
 import fingerspice as fs
 from analytic import impedance, table1_layers
-from commands import Command
 from fingerspice.base.errors import InputError
 from fingerspice.studies.fit import circuitfit
 from fingerspice.studies.fit.fitting import Fitted, followed
@@ -62,7 +61,7 @@ def data(circuit: fs.Circuit) -> Data:
     return measured(circuit, [100.0, 200.0], [30.0, 100.0, 500.0])
 
 
-def test_true_values_are_found_again(circuit: fs.Circuit, data: Data) -> None:
+def test_true_values_are_found_again(circuit, data):
     found = fs.fit(circuit, data, list(TRUE), skin="follow")
     for path, value in TRUE.items():
         assert found.estimates[path].value == pytest.approx(value, rel=1e-4)
@@ -75,9 +74,7 @@ def test_true_values_are_found_again(circuit: fs.Circuit, data: Data) -> None:
 @pytest.mark.parametrize(
     ("kind", "said"), [("given", "as given"), ("equal", "equal for all"), ("shares", "as equal shares of the values")]
 )
-def test_intervals_cover_the_truth_and_an_unknown_sigma_is_of_the_likelier_kind(
-    circuit: fs.Circuit, kind: str, said: str
-) -> None:
+def test_intervals_cover_the_truth_and_an_unknown_sigma_is_of_the_likelier_kind(circuit, kind, said):
     more = measured(circuit, [60.0, 120.0, 200.0], [30.0, 100.0, 500.0])
     force, rng, count, hits = more["f_el_mean"], np.random.default_rng(0), cases(30, 2), 0
     sigma = 0.02 * (np.full(force.size, force.mean()) if kind == "equal" else force)
@@ -94,7 +91,7 @@ def test_intervals_cover_the_truth_and_an_unknown_sigma_is_of_the_likelier_kind(
     assert covers(hits, 2 * count)
 
 
-def test_a_signal_over_time_which_noise_may_take_below_0(circuit: fs.Circuit) -> None:
+def test_a_signal_over_time_which_noise_may_take_below_0(circuit):
     t, true = np.linspace(0.0, 0.02, 41), {"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6}
     force = fs.simulate(circuit.replace(true), t_eval=t, rtol=1e-9).f_el
     found = fs.fit(circuit, {"t": t, "f_el": force}, list(true)).estimates
@@ -106,14 +103,14 @@ def test_a_signal_over_time_which_noise_may_take_below_0(circuit: fs.Circuit) ->
     assert found["Xgap.d"].value == pytest.approx(circuit.parameters["Xgap.d"].value, rel=1e-2)
 
 
-def test_the_source_may_be_fitted_by_its_short_name() -> None:
+def test_the_source_may_be_fitted_by_its_short_name():
     circuit, t = table1(), np.linspace(0.0, 0.02, 41)
     force = fs.simulate(circuit.replace({"Vdrive.amplitude": 170.0}), t_eval=t, rtol=1e-9).f_el
     found = fs.fit(circuit, {"t": t, "f_el": force}, ["source.amplitude"], bounds={"SOURCE.amplitude": (150.0, 250.0)})
     assert found.estimates["Vdrive.amplitude"].value == pytest.approx(170.0, rel=1e-6)
 
 
-def test_what_one_voltage_cannot_tell_is_said(circuit: fs.Circuit) -> None:
+def test_what_one_voltage_cannot_tell_is_said(circuit):
     # One frequency at one voltage has one mean force, from which no two parameters follow.
     rng = np.random.default_rng(1)
     for _ in range(cases(3, 1)):
@@ -126,7 +123,7 @@ def test_what_one_voltage_cannot_tell_is_said(circuit: fs.Circuit) -> None:
         assert "Measure at a second voltage as well" in note
 
 
-def test_a_network_is_fitted_by_differences_and_its_skin_follows_the_source() -> None:
+def test_a_network_is_fitted_by_differences_and_its_skin_follows_the_source():
     circuit = shipped("amplifier")
     ends = "gap.d", "skin.f", ".amplitude", ".frequency"
     path, skin, amplitude, frequency = (next(p for p in circuit.parameters if p.endswith(end)) for end in ends)
@@ -138,7 +135,7 @@ def test_a_network_is_fitted_by_differences_and_its_skin_follows_the_source() ->
     assert found.estimates[path].value == pytest.approx(gap, rel=1e-5)
 
 
-def test_circuits_that_have_no_such_mean_are_refused(circuit: fs.Circuit) -> None:
+def test_circuits_that_have_no_such_mean_are_refused(circuit):
     two = shipped("two_fingers")
     for other, said in (
         (two, "the circuit has 2 GAPs; allowed: one"),
@@ -148,9 +145,7 @@ def test_circuits_that_have_no_such_mean_are_refused(circuit: fs.Circuit) -> Non
             fs.fit(other, ONE, [f"{other.by_device('GAP')[0].name}.d"], average="run")
 
 
-def test_shares_that_fit_to_the_last_bit_are_the_likelier_errors(
-    circuit: fs.Circuit, data: Data, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shares_that_fit_to_the_last_bit_are_the_likelier_errors(circuit, data, monkeypatch):
     calls: list[Fitted] = []
 
     def exact(*given: Any) -> Fitted:
@@ -207,9 +202,7 @@ def by(**groups: object) -> dict[str, object]:
     ("finger,f_el_mean (N)\na,0.1\nb,0.2 oops\n", by(finger=["Xgap.d"]), "line 3"),
 ],
 )  # fmt: skip
-def test_bad_requests_are_refused_in_one_line(
-    circuit: fs.Circuit, tmp_path: Path, data: object, options: dict[str, object], text: str
-) -> None:
+def test_bad_requests_are_refused_in_one_line(circuit, tmp_path, data, options, text):
     if isinstance(data, str):
         (tmp_path / "data.csv").write_text(data)
         data = tmp_path / "data.csv"
@@ -218,7 +211,7 @@ def test_bad_requests_are_refused_in_one_line(
     assert "\n" not in str(told.value)
 
 
-def test_a_profile_of_clear_data_is_the_interval_of_the_derivatives(circuit: fs.Circuit, example: fs.Fit) -> None:
+def test_a_profile_of_clear_data_is_the_interval_of_the_derivatives(circuit, example):
     assert list(example.profiles) == ["Xgap.d"]
     profile, estimate = example.profiles["Xgap.d"], example.estimates["Xgap.d"]
     assert profile.shape == "symmetric"
@@ -233,7 +226,7 @@ def test_a_profile_of_clear_data_is_the_interval_of_the_derivatives(circuit: fs.
     assert "profile of Xgap.d" in str(example)
 
 
-def test_a_profile_says_where_the_data_set_no_end(circuit: fs.Circuit) -> None:
+def test_a_profile_says_where_the_data_set_no_end(circuit):
     # Far above the corner of the gap's resistance and capacitance, a larger resistance changes nothing.
     frequency = np.array([5e3, 7e3, 1e4, 2e4])
     runs = [fs.steady_state(circuit.replace({"Vdrive.frequency": f}), rtol=1e-8).solution.f_el_mean for f in frequency]
@@ -258,7 +251,7 @@ def impedances(quiet: fs.Circuit, f: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def test_an_impedance_against_frequency(quiet: fs.Circuit, tmp_path: Path) -> None:
+def test_an_impedance_against_frequency(quiet, tmp_path):
     f = np.geomspace(20.0, 2e4, 4)
     z = impedances(quiet, f)
     # From a table in kilohm, as magnitudes alone, and as complex numbers.
@@ -276,7 +269,7 @@ def test_an_impedance_against_frequency(quiet: fs.Circuit, tmp_path: Path) -> No
     found.plot()
 
 
-def test_intervals_from_noisy_impedances_cover_the_truth(quiet: fs.Circuit) -> None:
+def test_intervals_from_noisy_impedances_cover_the_truth(quiet):
     f, rng, count, hits = np.geomspace(20.0, 2e4, 6), np.random.default_rng(5), cases(25, 2), 0
     z = impedances(quiet, f)
     for _ in range(count):
@@ -300,7 +293,7 @@ def grouped(circuit: fs.Circuit, gaps: dict[str, float], leak: float) -> dict[st
 GAPS = {"left": 3.1e-6, "right": 3.9e-6}
 
 
-def test_each_group_has_its_own_parameters_and_all_share_the_others(circuit: fs.Circuit) -> None:
+def test_each_group_has_its_own_parameters_and_all_share_the_others(circuit):
     data = grouped(circuit, GAPS, 4e5)
     options: dict[str, Any] = {"groups": {"finger": ["xgap.d"]}, "skin": "follow", "starts": 1}
     found = fs.fit(circuit, data, ["Xgap.d", "xcoat.r"], **options)
@@ -326,7 +319,7 @@ def test_each_group_has_its_own_parameters_and_all_share_the_others(circuit: fs.
     assert (profile.low, profile.high) == pytest.approx((estimate.low, estimate.high), rel=2e-3)
 
 
-def test_groups_of_impedances_are_fitted_by_differences(quiet: fs.Circuit) -> None:
+def test_groups_of_impedances_are_fitted_by_differences(quiet):
     f = np.geomspace(20.0, 2e4, 2)
     z = [fs.phasor(quiet.replace({"Xgap.d": d}), f, skin="swept").impedance for d in GAPS.values()]
     data = {"frequency": np.tile(f, 2), "impedance": np.abs(np.concatenate(z)), "finger": np.repeat([1.0, 2.0], f.size)}
@@ -337,7 +330,7 @@ def test_groups_of_impedances_are_fitted_by_differences(quiet: fs.Circuit) -> No
         assert found.estimates["Xgap.d[2]"].value == pytest.approx(3.9e-6, rel=1e-6)
 
 
-def test_the_command_fits_the_tables_of_the_examples(command: Command) -> None:
+def test_the_command_fits_the_tables_of_the_examples(command):
     grouped = {"Xgap.d[left]": 3.1e-6, "Xgap.d[right]": 3.6e-6, "Xgap.d[thumb]": 4.2e-6, "Xcoat.r": 4e5}
     for table, words, true, groups in (
         ("measured.csv", ("Xgap.d,Xgap.r,Xgap.alpha",), TRUE, []),
@@ -359,15 +352,13 @@ def test_the_command_fits_the_tables_of_the_examples(command: Command) -> None:
     assert again["f_el"] == pytest.approx(again["fitted"], rel=0.1)
 
 
-def test_residuals_beyond_the_given_sigma_are_named(circuit: fs.Circuit, data: Data) -> None:
+def test_residuals_beyond_the_given_sigma_are_named(circuit, data):
     wrong = data["f_el_mean"] * (1.0 + 0.1 * (-1.0) ** np.arange(data["f_el_mean"].size))
     found = fs.fit(circuit, {**data, "f_el_mean": wrong, "sigma": 0.01 * wrong}, ["Xgap.d"], starts=1, skin="follow")
     assert any("times as large as sigma" in note and "so are the intervals" in note for note in found.notes)
 
 
-def test_the_example_finds_its_finger_and_predicts_another_force(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_example_finds_its_finger_and_predicts_another_force(capsys, tmp_path):
     program = runpy.run_path(str(CIRCUITS / "fit_finger.py"))
     found = program["fitted"]()
     program["main"].__globals__["fitted"] = lambda: found
@@ -384,7 +375,7 @@ def test_the_example_finds_its_finger_and_predicts_another_force(
     assert (high - low) / middle < 0.3 * (most - least) / area
 
 
-def test_a_report_has_the_layout_of_lmfit(example: fs.Fit) -> None:
+def test_a_report_has_the_layout_of_lmfit(example):
     lines, one = example.report().splitlines(), example.estimates["Xgap.d"]
     heads = [line for line in lines if line.startswith("[[")]
     assert heads == ["[[Fit Statistics]]", "[[Variables]]", "[[Correlations]] (unreported correlations are < 0.100)"]
@@ -401,9 +392,7 @@ def test_a_report_has_the_layout_of_lmfit(example: fs.Fit) -> None:
     assert lines[-1] == f"    C(Xgap.d, Xgap.r) = {example.correlation[0, 1]:+.4f}"
 
 
-def test_a_skin_held_at_one_frequency_is_told_and_biases_the_fit(
-    circuit: fs.Circuit, data: Data, command: Command
-) -> None:
+def test_a_skin_held_at_one_frequency_is_told_and_biases_the_fit(circuit, data, command):
     said = r"Xskin takes its data at f = 100 Hz, the source's fundamental is 30 to 500 Hz; with skin 'follow'"
     finger = circuit.replace({path: TRUE[path] for path in ("Xgap.r", "Xgap.alpha")})
     with pytest.warns(fs.FingerspiceWarning, match=said):
@@ -422,9 +411,7 @@ def test_a_skin_held_at_one_frequency_is_told_and_biases_the_fit(
     assert any(text.startswith("Xskin takes its data at f =") for text in json.loads(result.out)["warnings"])
 
 
-def test_a_skin_that_suits_every_source_is_not_told(
-    circuit: fs.Circuit, tmp_path: Path, recwarn: pytest.WarningsRecorder
-) -> None:
+def test_a_skin_that_suits_every_source_is_not_told(circuit, tmp_path, recwarn):
     both = {"Vdrive.frequency": [30.0, 500.0], "Xskin.f": [30.0, 500.0]}
     fs.batch(circuit, both, periodic=True)
     fs.batch(circuit, {"Vdrive.frequency": [30.0, 500.0]}, periodic=True, skin="follow")
@@ -446,8 +433,8 @@ def test_a_skin_that_suits_every_source_is_not_told(
     ],
 )
 def test_data_in_another_unit_are_told_and_end_in_a_bounded_number_of_evaluations(
-    circuit: fs.Circuit, data: Data, column: str, factor: float, row: int, said: str
-) -> None:
+    circuit, data, column, factor, row, said
+):
     # Of one value: many of these evaluations are far from any finger, and slow.
     some = {key: (factor if key == column else 1.0) * x[[row]] for key, x in data.items()}
     with pytest.warns(fs.FingerspiceWarning, match=said):
@@ -456,7 +443,7 @@ def test_data_in_another_unit_are_told_and_end_in_a_bounded_number_of_evaluation
     assert 1e-3 <= found.estimates["Xgap.d"].value / 3.5e-6 <= 1e3
 
 
-def test_the_axes_of_a_fits_picture_have_names_and_units(circuit: fs.Circuit, example: fs.Fit) -> None:
+def test_the_axes_of_a_fits_picture_have_names_and_units(circuit, example):
     top, bottom = example.plot().axes
     assert (top.get_ylabel(), bottom.get_xlabel()) == ("mean electroadhesive force [N]", "frequency of Vdrive [Hz]")
     assert top.get_legend_handles_labels()[1] == [f"amplitude of Vdrive = {u} V" for u in (100, 150, 200)]
@@ -465,9 +452,7 @@ def test_the_axes_of_a_fits_picture_have_names_and_units(circuit: fs.Circuit, ex
     assert bottom.get_xlabel() == "load of Xgap [N]"
 
 
-def test_a_start_outside_its_bounds_moves_into_them_and_a_value_at_one_is_named(
-    circuit: fs.Circuit, data: Data
-) -> None:
+def test_a_start_outside_its_bounds_moves_into_them_and_a_value_at_one_is_named(circuit, data):
     finger = circuit.replace({path: TRUE[path] for path in ("Xgap.r", "Xgap.alpha")})
     said = r"Xgap\.d is 3\.5e-06, outside its bounds 2e-06 to 3\.3e-06: it starts at 3\.3e-06"
     with pytest.warns(fs.FingerspiceWarning, match=said):
@@ -479,7 +464,7 @@ def test_a_start_outside_its_bounds_moves_into_them_and_a_value_at_one_is_named(
     assert any("at its bound" in note for note in found.notes)
 
 
-def test_sigma_in_percent_is_a_share_of_every_value(circuit: fs.Circuit, data: Data, tmp_path: Path) -> None:
+def test_sigma_in_percent_is_a_share_of_every_value(circuit, data, tmp_path):
     columns = [data["Vdrive.amplitude"], data["source.frequency"], 1e3 * data["f_el_mean"]]
     rows = [",".join(f"{x:.9g}" for x in row) for row in zip(*columns, strict=True)]
     head = "Vdrive.amplitude (V),frequency (Hz),f_el_mean (mN)"

@@ -6,7 +6,7 @@ import pytest
 import analytic
 import fingerspice as fs
 from ngspice_tools import CIRCUITS, run_ngspice
-from scenes import LAWS, cases, deck, every_law, finger, table1
+from scenes import LAWS, cases, deck, every_law, finger, listed, table1
 from start_reference import deck_of, random_network
 
 pytestmark = pytest.mark.filterwarnings("ignore:.* has no effect here")
@@ -165,23 +165,24 @@ def test_ic_of_capacitors_counts_with_uic_only() -> None:
 # The operating point with .ic held ---------------------------------------------------------------------------
 
 
-def test_nodes_that_ic_does_not_name_are_at_rest() -> None:
-    circuit = deck("V1 a 0 10", "R1 a b 1k", "R2 b 0 1k", "C1 b 0 1n", "R3 a c 1k", "C2 c 0 1n", "R4 c d 1k",
-                   "R5 d 0 2k", "C3 d 0 1n", ".ic v(c)=3", ".tran 1n 10n")  # fmt: skip
-    assert start(circuit) == pytest.approx({"a": 10.0, "b": 5.0, "c": 3.0, "d": 2.0}, rel=1e-13)
+HELD = {
+    "nodes that .ic does not name are at rest": (
+        "V1 a 0 10|R1 a b 1k|R2 b 0 1k|C1 b 0 1n|R3 a c 1k|C2 c 0 1n|R4 c d 1k|R5 d 0 2k|C3 d 0 1n|.ic v(c)=3",
+        {"a": 10.0, "b": 5.0, "c": 3.0, "d": 2.0},
+    ),
+    "a voltage source is stronger than .ic, and tied nodes take the mean": (
+        "V1 a 0 10|V2 a b 4|C1 b 0 1n|R3 b 0 1meg|Vf c d 4|Cc c 0 1n|Rd d 0 1k|.ic v(b)=3 v(c)=7 v(d)=5",
+        {"a": 10.0, "b": 6.0, "c": 8.0, "d": 4.0},
+    ),
+    "a node that only capacitors reach starts where .ic says": (
+        "V1 a 0 10|C1 a b 1n|C2 b 0 2n|.ic v(b)=7", {"a": 10.0, "b": 7.0},
+    ),
+}  # fmt: skip
 
 
-def test_a_voltage_source_is_stronger_than_ic_and_tied_nodes_take_the_mean() -> None:
-    circuit = deck("V1 a 0 10", "V2 a b 4", "C1 b 0 1n", "R3 b 0 1meg", "Vf c d 4", "Cc c 0 1n", "Rd d 0 1k",
-                   ".ic v(b)=3 v(c)=7 v(d)=5", ".tran 1n 10n")  # fmt: skip
-    assert start(circuit) == pytest.approx({"a": 10.0, "b": 6.0, "c": 8.0, "d": 4.0}, rel=1e-13)
-
-
-def test_a_node_that_only_capacitors_reach_starts_where_ic_says() -> None:
-    lines = ("V1 a 0 10", "C1 a b 1n", "C2 b 0 2n")
-    with pytest.raises(fs.InputError, match="C1 and C2 leave nodes that are reached by capacitors only"):
-        fs.simulate(deck(*lines, ".tran 1n 10n"))
-    assert start(deck(*lines, ".ic v(b)=7", ".tran 1n 10n"))["b"] == pytest.approx(7.0, rel=1e-13)
+@pytest.mark.parametrize(("lines", "expected"), HELD.values(), ids=HELD)
+def test_an_operating_point_with_ic(lines: str, expected: dict[str, float]) -> None:
+    assert start(deck(*lines.split("|"), ".tran 1n 10n")) == pytest.approx(expected, rel=1e-13)
 
 
 @every_law
@@ -266,29 +267,14 @@ def test_start_values_without_effect_are_listed() -> None:
 # Exports ------------------------------------------------------------------------------------------------------
 
 
-EXPORTED = [
-    ("amplifier", (), "v(top)=30 v(skin)=-5 v(drive)=40"),
-    ("amplifier", (SLOW,), "v(top)=30"),
-    ("amplifier", DC_AMPLIFIER, "v(top)=30"),
-    ("amplifier", DC_AMPLIFIER, "v(area)=20 v(top)=10"),
-    ("amplifier", (*DC_AMPLIFIER, SLOW), "v(amp)=3"),
-    ("fingerpad_5khz", (), "v(top)=30 v(skin)=10"),
-    ("fingerpad_5khz", (), "v(drive)=50 v(top)=-130 v(skin)=10"),
-    ("fingerpad_5khz", (("SIN(0 200 5k)", "DC 150"),), "v(drive)=50 v(top)=30 v(skin)=-60"),
-    ("fingerpad_5khz", (("SIN(0 200 5k)", "SIN(26 100 5k)"), ("1m uic", "1m")), "v(area)=20 v(top)=30"),
-    ("fingerpad_dispersive", (("30m uic", "3m uic"),), "v(top)=30 v(skin)=10"),
-    ("fingerpad_dispersive", (("30m uic", "3m"), ("SIN(0 120 100)", "SIN(50 120 100)")), "v(top)=30"),
-    ("two_fingers", (SLOW, ("0.5u 1m", "20n 40u")), "v(xlight.top)=30 v(xlight.skin)=5 v(body)=-10 v(firm)=20"),
-]
-
-
 # The laws in turn: each deck is run under both.
-@pytest.mark.parametrize("case", range(cases(2, 1) * len(EXPORTED)))
+@pytest.mark.parametrize("case", range(cases(2, 1) * len(listed("starts"))))
 @pytest.mark.filterwarnings("ignore:of the source's energy")
 def test_an_export_starts_where_the_deck_does(case: int) -> None:
-    name, changes, initial = EXPORTED[case % len(EXPORTED)]
+    exported = listed("starts")
+    name, changes, initial = exported[case % len(exported)]
     circuit = shipped(name, *changes, extra=f".ic {initial}")
-    for law in LAWS if name == "two_fingers" else (LAWS[(case + case // len(EXPORTED)) % 2],):
+    for law in LAWS if name == "two_fingers" else (LAWS[(case + case // len(exported)) % 2],):
         assert apart(circuit, law) <= 1.2e-4
 
 

@@ -64,14 +64,6 @@ def test_a_drive_of_a_thousand_volts_is_warned_about() -> None:
         fs.inverse_drive(table1(), force=wanted, rate=48e3)
 
 
-def test_a_run_of_its_own_finds_the_same_force() -> None:
-    found = fs.inverse_drive(table1(), force=fs.Sum((fs.DC(0.2), fs.Sine(0.1, 60.0))), duration=0.02)
-    t = np.linspace(0.0, 0.02, 301)
-    run = fs.simulate(found.circuit, t_stop=0.02, t_eval=t, rtol=1e-9)
-    # Between the samples too, where right after the start the layers' fast part shows (8e-5).
-    np.testing.assert_allclose(run.f_el, 0.2 + 0.1 * np.sin(2 * np.pi * 60.0 * t), rtol=0.0, atol=1e-4 * 0.3)
-
-
 def test_the_independent_transient_makes_the_wanted_force() -> None:
     """Forward by tests/analytic.py, which shares nothing with the package: a force that rises and falls."""
     rate, n = 20e3, 41

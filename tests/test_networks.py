@@ -297,21 +297,6 @@ def test_a_fast_area_returns_the_algebraic_law(law: str) -> None:
     assert 8.0 < off[1] / off[2] < 12.0
 
 
-def test_a_slow_area_stays_where_it_began() -> None:
-    circuit = deck(
-        "Vdrive drive 0 PULSE(150 -150 5m 0 0 5m 10m)", *finger("drive", "0", f=100.0, tau=1e6), ".tran 0.1m 20m uic"
-    )
-    t = np.linspace(0.0, 20e-3, 401)[1:-1] + 1e-8
-    s = fs.simulate(circuit, rtol=1e-9, t_eval=[0.0, *t], t_stop=20e-3)
-    # It began at g(u(0+)), the source's first jump taken.
-    began = float(analytic.area(float(s.u_gap[0])))
-    assert s.area[0] == pytest.approx(began, rel=1e-12, abs=0.0)
-    assert abs(began / analytic.area(0.0) - 1.0) > 1e-3
-    assert np.abs(s.area / began - 1.0).max() <= 1e-6
-    fixed = fs.simulate(circuit, area=began, t_eval=[0.0, *t], t_stop=20e-3)
-    assert np.abs(fixed.u_gap - s.u_gap).max() <= 1e-6 * np.abs(s.u_gap).max()
-
-
 def test_with_kinetics_the_mobile_law_has_no_fold() -> None:
     algebraic, slow = (
         deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, fn=1e-4, tau=tau), ".tran 20u 10m uic")

@@ -13,31 +13,11 @@ import pytest
 import fingerspice as fs
 from fingerspice.base.pages import SCREEN, Page, Table
 from fingerspice.circuit.describe import changes_text, drive_text, heading, waveform_text
-from scenes import shipped, table1
+from scenes import listed, shipped, table1
 
 ROOT = Path(__file__).parents[1]
-CELLS = (
-    f"import fingerspice as fs\ncircuit = fs.read_netlist({str(ROOT / 'circuits' / 'fingerpad.cir')!r})\ncircuit",
-    "solution = fs.simulate(circuit)\nsolution",
-    "solution.plot()",
-    "solution.plot('f_el', others=fs.simulate(circuit.replace({'Xgap.d': 5e-6})))",
-    "fs.steady_state(circuit)",
-    "comparison = fs.compare(circuit)\ncomparison.plot().show()",
-    "fs.phasor(circuit, [100, 1e3, 1e4])",
-    "fs.load(solution.to_netcdf('run.nc')).plot(window=(0.0, 0.02))",
-    "solution.to_dataframe()[['u_gap', 'f_el']].describe()",
-    "%matplotlib inline\nsolution.plot()",
-    "circuit.draw()",
-    "explorer = circuit.explore()\nexplorer",
-    "import urllib.request\nurllib.request.urlopen(explorer.url).headers['Content-Security-Policy']",
-    "fs.simulate(circuit, charge_law='mobile', rtol=1e-5, t_stop=0.03, area='frozen').explore()",
-    "fs.explore(browser=False)._repr_html_() is None",
-    "solution.plot();",
-    "for signal in ('f_el', 'u_gap'):\n    solution.plot(signal)",
-    "pictures = [solution.spectrum().plot() for _ in range(2)]\npictures[0].show()\npictures[1]",
-    "kept = pictures[0].savefig('spectrum.png')",
-    "explorers = [circuit.explore() for _ in range(9)]\n[one._thread.is_alive() for one in explorers]",
-)
+DECK = str(ROOT / "circuits" / "fingerpad.cir")
+CELLS = (f"import fingerspice as fs\ncircuit = fs.read_netlist({DECK!r})\ncircuit", *listed("cells"))
 
 
 @pytest.fixture(scope="module")

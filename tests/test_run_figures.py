@@ -14,7 +14,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.results import steps
 from fingerspice.results.summary import Figures
-from scenes import cases, deck, every_law, shipped, table1
+from scenes import cases, deck, every_law, listed, shipped, table1
 
 AREA = 34.9715871843e-6
 F, U, OFFSET, PHASE = 100.0, 200.0, 60.0, 140.0
@@ -201,18 +201,8 @@ def test_a_gap_alone_has_them_too() -> None:
 # Whatever outputs, and however the steps are kept
 
 
-RANDOM = [
-    ("local", "SIN(0 200 100)", "fingerpad"), ("mobile", "SIN(0 200 5k)", "fingerpad"),
-    ("local", "PULSE(-150 150 0 1u 1u 99u 200u)", "fingerpad"), ("local", "SIN(20 100 1k 0.3m 500 30)", "fingerpad"),
-    ("mobile", "PWL(0 0 1m 200 2m -50 2.5m 120)", "fingerpad"), ("local", "EXP(0 200 0.2m 0.1m 2m 0.3m)", "fingerpad"),
-    ("local", "SIN(0 200 5k)", "amplifier"), ("mobile", "SIN(0 200 5k)", "amplifier"),
-    ("local", "SIN(0 200 5k)", "two_fingers"), ("local", "SIN(0 200 3k)", "screen_protector"),
-    ("local", "SIN(0 200 1k)", "ungrounded_user"), ("local", "SIN(0 150 1k)", "fingerpad_dispersive"),
-]  # fmt: skip
-
-
 @pytest.mark.filterwarnings("ignore:sources names")
-@pytest.mark.parametrize(("law", "source", "name"), RANDOM)
+@pytest.mark.parametrize(("law", "source", "name"), listed("figures"))
 def test_figures_are_the_same_whatever_tstep(law: str, source: str, name: str) -> None:
     rng = np.random.default_rng(len(source) + len(name))
     circuit = shipped(name).replace({"Vdrive": source})

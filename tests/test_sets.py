@@ -412,23 +412,6 @@ def test_the_options_apply_sets_and_later_ones_have_the_last_word(command: Comma
     assert applied(command)[0] == applied(command, "--set", "Xgap.d=3u")[0] == []
 
 
-def test_a_run_on_the_command_line_is_that_of_python_and_its_file_cites(command: Command, pad: fs.Circuit) -> None:
-    Path("own.cir").write_text(PAD.read_text())
-    result = command("run", "own.cir", "--no-plot", "--finger", "moist", "--stop", "10m")
-    assert result.code == 0
-    assert f"{pad.title} (changed: set moist)" in result.out
-    loaded = fs.load("out/own.nc")
-    expected = fs.simulate(with_set("moist", pad), t_stop=1e-2)
-    np.testing.assert_array_equal(loaded.f_el, expected.f_el)  # type: ignore[arg-type]
-    assert str(loaded.cite()) == str(expected.cite())
-
-
-def test_one_of_several_fingers_may_be_named(command: Command) -> None:
-    Path("two.cir").write_text((CIRCUITS / "two_fingers.cir").read_text())
-    _, changed = applied(command, "--finger", "Xlight=moist", "--finger", "xfirm = dry", deck="two.cir")
-    assert [changed[f"{one}.Xgap.r"] for one in ("Xlight", "Xfirm")] == ["100000.0", "7000000.0"]
-
-
 def test_the_sets_are_listed_and_shown(command: Command) -> None:
     listed = command("sets")
     assert listed.out.strip() == str(fs.parameters())

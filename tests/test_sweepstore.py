@@ -23,7 +23,7 @@ import xarray as xr
 from scipy import stats
 
 import fingerspice as fs
-from commands import Command, tree
+from commands import tree
 from fingerspice.studies.sweep import chunks, populations
 from fingerspice.studies.sweep.populations import Draws, Plan
 from processes import forked, no_room_here
@@ -118,7 +118,7 @@ def killing(pids: Callable[[], list[int]], store: Path, most: int) -> Iterator[l
         thread.join()
 
 
-def test_draws_in_parts_are_those_of_the_whole(circuit: fs.Circuit) -> None:
+def test_draws_in_parts_are_those_of_the_whole(circuit):
     plan = Plan(circuit, PARAMETERS, 1 << 14, 5, 1 << 30)
     draws = plan.quantiles(stats.qmc.Sobol(2, scramble=True, bits=30, rng=5).random(plan.n))
     for count in (1 << 9, 1 << 14):
@@ -138,7 +138,7 @@ def both(circuit: fs.Circuit, asked: dict[str, Any], path: Path, **how: Any) -> 
     return memory, stored
 
 
-def test_a_store_has_what_a_sweep_in_memory_has(circuit: fs.Circuit, tmp_path: Path) -> None:
+def test_a_store_has_what_a_sweep_in_memory_has(circuit, tmp_path):
     # 3 x 5 x 1 places and 32 draws, chunks of 2 x 32: also such that reach over the edge.
     asked = {**PARAMETERS, "Xgap.r": [5e5, 6e5, 7e5, 8e5, 9e5], "Xcoat.r": [2e5]}
     how = {**HOW, "n": 32, "outputs": ("f_el_mean_periodic", "f_el_rms_periodic")}
@@ -151,7 +151,7 @@ def test_a_store_has_what_a_sweep_in_memory_has(circuit: fs.Circuit, tmp_path: P
         both(circuit, values, tmp_path / f"{len(str(values))}.zarr", **how)
 
 
-def test_a_network_and_several_fingers_go_into_a_store(tmp_path: Path) -> None:
+def test_a_network_and_several_fingers_go_into_a_store(tmp_path):
     circuit = shipped("two_fingers")
     path = next(name for name in circuit.parameters if name.endswith("ap.d"))
     how = {"outputs": ("f_el_mean",), "t_stop": 5e-3}
@@ -159,7 +159,7 @@ def test_a_network_and_several_fingers_go_into_a_store(tmp_path: Path) -> None:
     assert stored.f_el_mean.dims == (path, "gap")
 
 
-def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit: fs.Circuit, tmp_path: Path) -> None:
+def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit, tmp_path):
     # Adhesion that leaves no contact.
     asked = {"Xgap.r": [1e6, 2e6], "Xgap.c2": np.where(np.arange(80) == 70, 1e9, 5000.0)}
     how = {"outputs": ("f_el_mean",), "t_stop": 2e-2, "threads": 1}
@@ -168,7 +168,7 @@ def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit:
     assert stored.attrs["failures"] == memory.attrs["failures"]
 
 
-def test_a_single_set_of_parameters_goes_into_a_store(circuit: fs.Circuit, tmp_path: Path, command: Command) -> None:
+def test_a_single_set_of_parameters_goes_into_a_store(circuit, tmp_path, command):
     # It is number 0 of its table, and a grid of nothing but 0 is in the store, too.
     _, stored = both(circuit, {"finger": ["moist"], "Xgap.d": [3e-6, 4e-6]}, tmp_path / "s.zarr", **HOW)
     assert stored.finger.values.tolist() == ["moist"]
@@ -177,9 +177,7 @@ def test_a_single_set_of_parameters_goes_into_a_store(circuit: fs.Circuit, tmp_p
 
 
 @pytest.mark.usefixtures("_forked_workers")
-def test_workers_that_are_killed_again_and_again_cost_nothing(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
-) -> None:
+def test_workers_that_are_killed_again_and_again_cost_nothing(circuit, whole, tmp_path):
     path = tmp_path / "s.zarr"
 
     def children() -> list[int]:
@@ -215,9 +213,7 @@ class Deadly:
 
 
 @pytest.mark.usefixtures("_given_up_at_once")
-def test_chunks_that_always_cost_their_worker_end_the_sweep(
-    circuit: fs.Circuit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_that_always_cost_their_worker_end_the_sweep(circuit, tmp_path, monkeypatch):
     monkeypatch.setattr(chunks, "MOST_LOST", 1)
     with pytest.raises(fs.InputError, match=r"one chunk after another were lost, 1 times.* what is written stays"):
         fs.sweep(circuit, {"Xgap.d": Deadly()}, store=tmp_path / "s.zarr", workers=1, **{**HOW, "n": 64})
@@ -231,9 +227,7 @@ class DeadlyOnce(Deadly):
 
 
 @pytest.mark.usefixtures("_given_up_at_once")
-def test_a_chunk_that_costs_its_worker_is_named_and_the_others_are_in_the_store(
-    circuit: fs.Circuit, tmp_path: Path
-) -> None:
+def test_a_chunk_that_costs_its_worker_is_named_and_the_others_are_in_the_store(circuit, tmp_path):
     path = tmp_path / "s.zarr"
     said = r"chunk (\d) of the sweep were lost, 2 times.*; allowed: .* what is written stays"
     with pytest.raises(fs.InputError, match=said) as told:
@@ -257,9 +251,7 @@ if __name__ == "__main__":
 """
 
 
-def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
-) -> None:
+def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(circuit, whole, tmp_path):
     path, enough = tmp_path / "s.zarr", 3 * CHUNKS // 4
     (tmp_path / "script.py").write_text(SCRIPT)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
@@ -280,14 +272,12 @@ def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(
     assert tree(path) == whole
 
 
-def test_a_shard_without_chunks_does_nothing(circuit: fs.Circuit, tmp_path: Path) -> None:
+def test_a_shard_without_chunks_does_nothing(circuit, tmp_path):
     found = fs.sweep(circuit, {"Xgap.d": [3e-6, 4e-6]}, store=tmp_path / "s.zarr", shard=(3, 3), **HOW)
     assert (found.attrs["chunks"], found.attrs["chunks_found"], found.attrs["chunks_missing"]) == (0, 0, 1)
 
 
-def test_shards_by_separate_processes_make_the_whole(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
-) -> None:
+def test_shards_by_separate_processes_make_the_whole(circuit, whole, tmp_path):
     path = tmp_path / "s.zarr"
     # At once: whichever comes first creates the store.
     shards = [forked(partial(fs.sweep, circuit, PARAMETERS, store=path, shard=(i, 3), **HOW)) for i in (1, 2)]
@@ -311,9 +301,7 @@ def cluster_of(workers: int, processes: bool) -> Any:
 
 
 @pytest.mark.usefixtures("_forked_workers")
-def test_dask_workers_that_are_killed_again_and_again_cost_nothing(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_dask_workers_that_are_killed_again_and_again_cost_nothing(circuit, whole, tmp_path, monkeypatch):
     path = tmp_path / "s.zarr"
 
     def workers() -> list[int]:
@@ -331,9 +319,7 @@ def test_dask_workers_that_are_killed_again_and_again_cost_nothing(
             fs.sweep(circuit, PARAMETERS, store=tmp_path / "o.zarr", scheduler=cluster.scheduler_address, **HOW)
 
 
-def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(circuit, whole, tmp_path, monkeypatch):
     path, part, write = tmp_path / "s.zarr", Draws.part, chunks.Work._write
     begun, written, at_once = 0, 0, 0
 
@@ -363,9 +349,7 @@ def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
     assert tree(path) == whole
 
 
-def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(
-    circuit: fs.Circuit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(circuit, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     assert chunks.PATIENCE <= 5.0
     monkeypatch.setattr(chunks, "PATIENCE", 0.5)
@@ -378,7 +362,7 @@ def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_half_written_store_of_another_sweep_is_refused_and_kept(circuit: fs.Circuit, tmp_path: Path) -> None:
+def test_a_half_written_store_of_another_sweep_is_refused_and_kept(circuit, tmp_path):
     path = tmp_path / "s.zarr"
     fs.sweep(circuit, PARAMETERS, store=path, shard=(1, 2), **HOW)
     before = tree(path)
@@ -409,9 +393,7 @@ def test_a_half_written_store_of_another_sweep_is_refused_and_kept(circuit: fs.C
     assert (path / "mine.txt").read_text() == "mine"
 
 
-def test_a_chunk_that_is_cut_short_or_not_marked_is_run_again(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
-) -> None:
+def test_a_chunk_that_is_cut_short_or_not_marked_is_run_again(circuit, whole, tmp_path):
     path = tmp_path / "s.zarr"
     copied(whole, path)
     os.truncate(path / "error" / "c" / "1" / "7", 100)
@@ -425,9 +407,7 @@ def test_a_chunk_that_is_cut_short_or_not_marked_is_run_again(
     assert tree(path) == whole
 
 
-def test_a_chunk_of_which_a_bit_has_changed_is_run_again(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, command: Command
-) -> None:
+def test_a_chunk_of_which_a_bit_has_changed_is_run_again(circuit, whole, tmp_path, command):
     path, rng = tmp_path / "s.zarr", np.random.default_rng(5)
     copied(whole, path)
     assert "chunks of 6 arrays are as they were written" in command("check", str(path)).out
@@ -464,9 +444,7 @@ def test_a_chunk_of_which_a_bit_has_changed_is_run_again(
         ),
     ],
 )
-def test_bad_requests_are_refused_before_anything_is_written(
-    circuit: fs.Circuit, parameters: Any, how: dict[str, Any], said: str, tmp_path: Path
-) -> None:
+def test_bad_requests_are_refused_before_anything_is_written(circuit, parameters, how, said, tmp_path):
     with pytest.raises(fs.InputError, match=said) as told:
         fs.sweep(circuit, {**PARAMETERS, **parameters}, **{"store": tmp_path / "s.zarr", **HOW, **how})
     assert "\n" not in str(told.value)
@@ -493,7 +471,7 @@ def file(tmp_path: Path) -> Path:
 
 
 @pytest.mark.usefixtures("_forked_workers")
-def test_the_command_fills_a_store_shard_by_shard(file: Path, command: Command) -> None:
+def test_the_command_fills_a_store_shard_by_shard(file, command):
     store = file.parent / "o.zarr"
     words = ("sweep", str(file), "--store", str(store))
     first = command(*words, "--shard", "1/2", "--json")
@@ -523,9 +501,7 @@ def test_the_command_fills_a_store_shard_by_shard(file: Path, command: Command) 
     ("words", "said"),
     listed("sweep_commands"),
 )
-def test_bad_commands_are_refused_in_one_sentence(
-    file: Path, command: Command, words: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_commands_are_refused_in_one_sentence(file, command, words, said, monkeypatch):
     monkeypatch.chdir(file.parent)
     before = tree(file.parent)
     done = command("sweep", str(file), *words)
@@ -535,9 +511,7 @@ def test_bad_commands_are_refused_in_one_sentence(
     assert tree(file.parent) == before
 
 
-def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(
-    file: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(file, command, monkeypatch):
     monkeypatch.chdir(file.parent)
     words = ("sweep", str(file), "--store", "o.zarr")
     monkeypatch.setattr(chunks, "CHUNK", CHUNK)
@@ -555,7 +529,7 @@ def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(
 SWEPT = {"periodic": True, "outputs": ("f_el_mean_periodic",), "rtol": 1e-4}
 
 
-def test_a_grid_has_a_dimension_for_each_array(circuit: fs.Circuit) -> None:
+def test_a_grid_has_a_dimension_for_each_array(circuit):
     gaps, loads = [3e-6, 3.5e-6, 4e-6], [0.3, 0.5]
     found = fs.sweep(circuit, {"xgap.D": gaps, "Xgap.fn": loads}, **SWEPT)
     assert found.f_el_mean_periodic.dims == ("Xgap.d", "Xgap.fn")
@@ -565,7 +539,7 @@ def test_a_grid_has_a_dimension_for_each_array(circuit: fs.Circuit) -> None:
             assert float(found.f_el_mean_periodic[i, j]) == pytest.approx(mean, rel=2e-4)
 
 
-def test_a_population_is_the_same_at_every_place_and_for_every_seed(circuit: fs.Circuit) -> None:
+def test_a_population_is_the_same_at_every_place_and_for_every_seed(circuit):
     law = stats.lognorm(0.1, scale=3.5e-6)
     asked: dict[str, Any] = {"source.frequency": [100.0, 1000.0], "Xgap.d": law}
     found, again, other = (fs.sweep(circuit, asked, n=64, seed=seed, **SWEPT) for seed in (3, 3, 4))
@@ -578,7 +552,7 @@ def test_a_population_is_the_same_at_every_place_and_for_every_seed(circuit: fs.
     np.testing.assert_array_equal(alone.f_el_mean_periodic, found.f_el_mean_periodic[1])
 
 
-def test_indices_are_those_of_the_ishigami_function(circuit: fs.Circuit, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_indices_are_those_of_the_ishigami_function(circuit, monkeypatch):
     def function(x: np.ndarray) -> np.ndarray:
         return np.asarray(np.sin(x[0]) + 7.0 * np.sin(x[1]) ** 2 + 0.1 * x[2] ** 4 * np.sin(x[0]))
 
@@ -608,13 +582,13 @@ def test_indices_are_those_of_the_ishigami_function(circuit: fs.Circuit, monkeyp
     assert all(row["low"] <= row["total"] <= row["high"] for row in rows)
 
 
-def test_one_parameter_alone_has_the_whole_variance(circuit: fs.Circuit) -> None:
+def test_one_parameter_alone_has_the_whole_variance(circuit):
     found = fs.sobol(circuit, {"Xgap.d": stats.lognorm(0.1, scale=3.5e-6)}, n=64, skin="follow", **SWEPT)
     for kind in ("first", "total"):
         np.testing.assert_allclose(found[f"f_el_mean_periodic_{kind}"], [1.0], atol=0.05)
 
 
-def test_what_matters_to_the_force_is_named_at_every_place(circuit: fs.Circuit) -> None:
+def test_what_matters_to_the_force_is_named_at_every_place(circuit):
     asked = {
         "source.frequency": [100.0, 5000.0], "Xgap.d": stats.lognorm(0.1, scale=3.5e-6),
         "Xcoat.r": stats.lognorm(1e-3, scale=2e5),
@@ -638,7 +612,7 @@ def test_what_matters_to_the_force_is_named_at_every_place(circuit: fs.Circuit) 
     assert float(found.f_el_mean_periodic_alone.sel(parameter="Xgap.d", quantile=0.95)[1]) == float(alone[0])
 
 
-def test_several_paths_are_scaled_together(circuit: fs.Circuit) -> None:
+def test_several_paths_are_scaled_together(circuit):
     both = fs.sweep(circuit, {"Xgap.alpha, xgap.beta": [0.8, 1.2], "Xgap.fn": 0.3}, **SWEPT)
     assert both.f_el_mean_periodic.dims == ("Xgap.alpha,Xgap.beta",)
     for i, factor in enumerate((0.8, 1.2)):
@@ -649,7 +623,7 @@ def test_several_paths_are_scaled_together(circuit: fs.Circuit) -> None:
         fs.sweep(circuit, {"Xgap.alpha, Xgap.beta": [0.8], "Xgap.alpha": 54.4}, **SWEPT)
 
 
-def test_the_shipped_sweep_of_fig_3_says_what_matters_where(tmp_path: Path, command: Command) -> None:
+def test_the_shipped_sweep_of_fig_3_says_what_matters_where(tmp_path, command):
     done = command("sweep", str(CIRCUITS / "fig3.toml"), "--out", str(tmp_path), "--json")
     assert done.code == 0, done.err
     shares: dict[float, dict[str, float]] = {}
@@ -677,9 +651,7 @@ def test_the_shipped_sweep_of_fig_3_says_what_matters_where(tmp_path: Path, comm
         ({}, {}, "a mapping"),
     ],
 )
-def test_bad_sweeps_are_refused_in_one_sentence(
-    circuit: fs.Circuit, parameters: Any, how: dict[str, Any], said: str
-) -> None:
+def test_bad_sweeps_are_refused_in_one_sentence(circuit, parameters, how, said):
     with pytest.raises(fs.InputError, match=said) as told:
         fs.sweep(circuit, parameters, **how)
     assert "\n" not in str(told.value)
@@ -707,7 +679,7 @@ def described(folder: Path, text: str) -> str:
     return str(folder / "fingers.toml")
 
 
-def test_the_command_writes_scenes_indices_and_a_picture(tmp_path: Path, command: Command) -> None:
+def test_the_command_writes_scenes_indices_and_a_picture(tmp_path, command):
     file = described(tmp_path, SMALL)
     done = command("sweep", file, "--out", str(tmp_path / "o"), "--json")
     answer = json.loads(done.out)
@@ -727,9 +699,7 @@ def test_the_command_writes_scenes_indices_and_a_picture(tmp_path: Path, command
     ("change", "said"),
     listed("sweep_files"),
 )
-def test_bad_files_are_refused_in_one_sentence(
-    tmp_path: Path, command: Command, change: tuple[str, str], said: str
-) -> None:
+def test_bad_files_are_refused_in_one_sentence(tmp_path, command, change, said):
     done = command("sweep", described(tmp_path, SMALL.replace(*change)), "--out", str(tmp_path / "o"))
     assert done.code == 2
     assert said in done.err

@@ -411,7 +411,7 @@ def test_what_follows_from_the_analysis_is_said() -> None:
 
 def test_a_source_given_as_text_reads_as_in_the_deck() -> None:
     circuit = table1(tran=TRAN)
-    for text, _ in SAME:
+    for text in (text for text, _ in SAME if "AC" not in text):
         assert source_from_text(text, circuit) == wave(text)
     # Which a deck does not take, as simulators differ about it.
     assert source_from_text("AM(200 5k 50)", circuit) == fs.AM(200.0, 5e3, 50.0)
