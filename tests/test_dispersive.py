@@ -10,7 +10,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.describe import energy_outside
 from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
-from scenes import CIRCUITS, dispersive_deck, every_law, table1_deck
+from scenes import CIRCUITS, cases, dispersive_deck, every_law, table1_deck
 
 BAND = np.geomspace(*SKIN_BAND, 401)
 D = 350e-6
@@ -197,7 +197,7 @@ def test_am_and_noise_are_the_superposition_of_their_phasors() -> None:
 @every_law
 @pytest.mark.parametrize("shape", ["sine", "square"])
 def test_the_coupled_run_is_the_independent_references(shape: str, law: str) -> None:
-    f, periods, rtol = 100.0, 3, 1e-9
+    f, periods, rtol = 100.0, cases(3, 1), 1e-9
     segments, waveform = ref.square_segments(200.0, f, periods), fs.Square(200.0, f)
     if shape == "sine":
         segments, waveform = ref.sine_segments(200.0, f, periods / f), fs.Sine(200.0, f)
