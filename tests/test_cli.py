@@ -379,10 +379,7 @@ def answer(result: Result, command: str) -> Any:
     return data
 
 
-@pytest.mark.parametrize(
-    ("line", "code"),
-    listed("json"),
-)
+@pytest.mark.parametrize(("line", "code"), listed("json"))
 def test_the_keys_are_the_same_however_a_command_ends(command: Command, line: str, code: int) -> None:
     Path("flat.cir").write_text(FLAT)
     Path("rc.cir").write_text(RC)

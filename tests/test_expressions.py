@@ -22,7 +22,10 @@ HERE = Where("deck.cir", 3, 10)
 NAMES = {"thick": 2.0, "Rho": 3.0, "if": 5.0}
 
 
-@pytest.mark.parametrize(("text", "value"), [*listed("arithmetic"), *listed("arithmetic_with_names")])
+LONG = [("1" + 900 * "+1", 901.0)]
+
+
+@pytest.mark.parametrize(("text", "value"), [*listed("arithmetic"), *listed("arithmetic_with_names"), *LONG])
 def test_arithmetic_means_what_ngspice_means_with_names_conditions_and_nesting(text: str, value: float) -> None:
     assert evaluate(text, NAMES, HERE) == pytest.approx(value, rel=1e-15)
 
@@ -164,7 +167,7 @@ def test_numbers_have_the_value_that_spice_gives_them_and_a_suffix_costs_no_roun
 
 
 def test_what_is_no_number_or_read_differently_elsewhere_is_refused() -> None:
-    for text, hint in listed("no_numbers"):
+    for text, hint in [*listed("no_numbers"), (500 * "9", "characters")]:
         with pytest.raises(ValueError, match=hint):
             parse_number(text)
 

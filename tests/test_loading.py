@@ -192,10 +192,7 @@ def changed(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    "part",
-    listed("run_files"),
-)
+@pytest.mark.parametrize("part", listed("run_files"))
 def test_a_file_is_data_whoever_wrote_it(part: dict[str, object], tmp_path: Path) -> None:
     path = changed(tmp_path / "run.nc", lambda run: run["circuit"]["elements"][0].update(part))
     with pytest.warns(fs.FingerspiceWarning, match="cannot be made again"):

@@ -22,7 +22,7 @@ from fingerspice.circuit.circuit import AcSweep
 from fingerspice.physics.phasor import coupled_area
 from fingerspice.studies.steady import sweep_frequencies
 from ngspice_tools import CIRCUITS, call_ngspice
-from scenes import deck, table1, table1_deck
+from scenes import deck, listed, table1, table1_deck
 
 MM2 = 1e6
 FREQUENCIES = [1.0, 10.0, 100.0, 700.0, 5000.0, 1e5]
@@ -167,17 +167,7 @@ def test_with_a_given_area_the_gain_is_defined_for_a_source_without_fundamental(
 
 @pytest.mark.parametrize(
     ("source", "frequency", "area", "message"),
-    [
-        ("PWL(0 0 1m 100)", None, 35e-6, "the source has no fundamental: give the frequencies in Hz"),
-        ("PWL(0 0 1m 100)", 100.0, "mean", "area='mean' needs the amplitude of the source's fundamental"),
-        ("5", 100.0, "mean", "area='mean' needs the amplitude"),
-        ("SIN(0 200 100)", 0.0, "mean", "frequency is 0.0 Hz; allowed: positive numbers"),
-        ("SIN(0 200 100)", [100.0, -5.0], "mean", "allowed: positive numbers"),
-        ("SIN(0 200 100)", math.nan, "mean", "frequency is nan Hz; allowed: positive numbers"),
-        ("SIN(0 200 100)", math.inf, "mean", "allowed: positive numbers"),
-        ("SIN(0 200 100)", [[100.0]], "mean", "allowed: positive numbers"),
-        ("SIN(0 200 100)", 100.0, "coupled", "area is 'coupled'; allowed: 'mean', 'frozen' or a number in m^2"),
-    ],
+    [*listed("phasors"), ("PWL(0 0 1m 100)", None, 35e-6, "the source has no fundamental: give the frequencies in Hz")],
 )
 def test_what_has_no_phasor_is_refused_with_what_is_allowed(source, frequency, area, message: str) -> None:
     with pytest.raises(fs.InputError) as caught:

@@ -242,10 +242,7 @@ def test_a_dispersive_skin_has_no_f_and_takes_its_thickness() -> None:
 # Names, tables and bad input.
 
 
-@pytest.mark.parametrize(
-    ("given", "said"),
-    listed("sets"),
-)
+@pytest.mark.parametrize(("given", "said"), listed("sets"))
 def test_an_unknown_set_or_one_of_another_kind_is_refused_with_what_is_allowed(given: tuple, said: str) -> None:
     with pytest.raises(fs.InputError, match=re.escape(said)):
         fs.parameters(*given)

@@ -259,19 +259,7 @@ def test_what_is_no_file_is_refused(in_folder: None) -> None:
 # Tables -------------------------------------------------------------------------------------------------------
 
 
-TABLES: dict[str, str] = {
-    "commas": "0,1\n0.001,-2.5\n0.003,4\n",
-    "commas and blanks": "0, 1\n0.001 , -2.5\n 0.003, 4\n",
-    "blanks": "0 1\n  0.001   -2.5\n0.003 4",
-    "tabs": "0\t1\n0.001\t-2.5\n0.003\t4\n",
-    "header": "time,u\n0,1\n0.001,-2.5\n0.003,4\n",
-    "units": "time (ms), u [kV]\n0,0.001\n1,-0.0025\n3,0.004\n",
-    "header of NumPy": "# taken on a rainy day\n# t (s), u (V)\n0,1\n1e-3,-2.5\n3e-3,4\n",
-    "quoted": '"time (us)","drive (mV)"\r\n"0","1000"\r\n"1000","-2500"\r\n"3000","4000"\r\n',
-    "SPICE": "0 1\n1m -2500m\n3m 4\n",
-    "comments": "# one\n\n0,1\n# two\n0.001,-2.5\n\n0.003,4\n",
-    "utf-8 with a mark": "\ufefft,u\n0,1\n0.001,-2.5\n0.003,4\n",
-}
+TABLES: dict[str, str] = dict(listed("two_columns"))
 
 
 @pytest.mark.parametrize("text", TABLES.values(), ids=TABLES.keys())

@@ -146,13 +146,7 @@ def test_a_signal_that_jumps_at_the_end_of_its_period_is_periodic(jumps: str) ->
     assert 0.99 < found.shown_variance / found.variance < 1.0
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        *listed("spectra"),
-        ({"resolution": math.nan}, "a number of Hz, > 0"),
-    ],
-)
+@pytest.mark.parametrize(("options", "said"), [*listed("spectra"), ({"resolution": math.nan}, "a number of Hz, > 0")])
 def test_what_a_spectrum_refuses(sine: fs.Solution, options: dict[str, object], said: str) -> None:
     with pytest.raises(fs.InputError, match=said):
         sine.spectrum(**options)  # type: ignore[arg-type]

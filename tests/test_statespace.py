@@ -184,10 +184,7 @@ REFUSALS = {
     "no ground": ([V.replace(" 0 ", " n9 ", 1), COAT, GAP.replace("n1 0", "n1 n9")], "no element touches ground"),
     "area node as a conductor": ([V, "Xcoat n0 area area LAYER d=1u eps_r=3.9", GAP], "is floating"),
     "antiparallel sources": ([V, "Vsecond 0 n0 5", COAT, GAP], "Vdrive and Vsecond are voltage sources in parallel"),
-    "source loop": (
-        [V, "Vb n0 n5 5", "Vc n5 0 5", COAT, GAP],
-        "Vc closes a loop of voltage sources with Vdrive, Vb",
-    ),
+    "source loop": ([V, "Vb n0 n5 5", "Vc n5 0 5", COAT, GAP], "Vc closes a loop of voltage sources with Vdrive, Vb"),
     "current source into nothing": (
         ["Idrive 0 drive 1m", "Ia drive 0 2m"],
         "Idrive is a current source without a path: node 'drive' is reached through current sources only",

@@ -181,11 +181,7 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        *listed("streams"),
-        ({"count": 10**10, "step": 1e-12, "t_stop": 1.0}, "outputs with"),
-    ],
+    ("given", "said"), [*listed("streams"), ({"count": 10**10, "step": 1e-12, "t_stop": 1.0}, "outputs with")]
 )
 def test_a_stream_that_cannot_be_is_refused_at_once(given: dict[str, object], said: str) -> None:
     with pytest.raises(fs.InputError, match=said.replace("(", r"\(")):

@@ -200,10 +200,7 @@ def test_no_warning_about_values_that_an_optimiser_chooses() -> None:
         fs.torch.Simulator(table1(), {"Xgap.d": 0.1}, "u_gap", t=TIMES, t_stop=T_STOP)()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "how", "text"),
-    listed("simulators"),
-)
+@pytest.mark.parametrize(("arguments", "how", "text"), listed("simulators"))
 def test_refused_when_it_is_made(arguments: tuple[Any, ...], how: dict[str, Any], text: str) -> None:
     with pytest.raises(InputError, match=text):
         fs.torch.Simulator(table1(), *arguments, **how)
@@ -212,13 +209,9 @@ def test_refused_when_it_is_made(arguments: tuple[Any, ...], how: dict[str, Any]
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({}, "there are no values"),
-        ({"Xgap.e": 1.0}, "unknown parameter 'Xgap.e'"),
-        ({"Xgap.d": -1e-6}, r"Xgap.d is -1e-06 in scene 0; allowed"),
-        ({"Xgap.d": [3e-6, 4e-6], "Xgap.r": [1e6, 1e6, 1e6]}, r"shapes \(2,\) \(Xgap.d\), \(3,\) \(Xgap.r\); allowed"),
+        *listed("scenes_of_simulators"),
         ({"Xgap.d": 3e-6 + 1j}, "Xgap.d is .*; allowed: a tensor or array of numbers"),
         ({"Xgap.d": torch.tensor(1j)}, "Xgap.d is a tensor of torch.complex64; allowed: real numbers"),
-        ({"Xgap.mu": [0.3, 50.0]}, "1 of 2 scenes cannot be run; scene 1: .*no contact"),
     ],
 )
 def test_refused_when_it_is_called(values: dict[str, Any], text: str) -> None:
