@@ -276,9 +276,7 @@ def test_a_scene_past_its_fold_fails_by_itself() -> None:
         (table1(extra="Rload drive 0 1k\nCload top 0 1p"), {"Xgap.d": [3e-6]}, ("f_el_mean",), "no series stack"),
     ],
 )
-def test_what_lockstep_cannot_do_goes_one_by_one(
-    circuit: Circuit, parameters: dict[str, Any], outputs: tuple[str, ...], why: str
-) -> None:
+def test_what_lockstep_cannot_do_goes_one_by_one(circuit, parameters, outputs, why):
     found = fs.batch(circuit, parameters, outputs=outputs, rtol=1e-6)
     assert found.attrs["n_ordinary"] == 1
     assert why in found.attrs["ordinary"]

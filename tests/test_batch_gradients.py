@@ -74,10 +74,7 @@ for kind in ("sine", "square"):
 
 
 @pytest.mark.parametrize(("status", "circuit", "parameters", "paths", "rtols", "how"), CASES.values(), ids=CASES)
-def test_derivatives_have_the_errors_allowed_and_stated(
-    status: int, circuit: Circuit, parameters: dict[str, Any], paths: tuple[str, ...], rtols: tuple[float, ...],
-    how: dict[str, Any],
-) -> None:  # fmt: skip
+def test_derivatives_have_the_errors_allowed_and_stated(status, circuit, parameters, paths, rtols, how):
     how = {"outputs": MEANS, **how}
     n = len(next(iter(parameters.values())))
     scenes = [circuit.varied({path: values[i] for path, values in parameters.items()}) for i in range(n)]

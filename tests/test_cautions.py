@@ -17,7 +17,7 @@ from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.describe import course_warnings, energy_outside, skin_error
-from fingerspice.circuit.devices import DEVICES, REST_AREA, SOURCES, ParameterSpec
+from fingerspice.circuit.devices import DEVICES, REST_AREA, SOURCES
 from fingerspice.waveforms.waveform import as_waveform
 from scenes import deck, finger, table1, table1_deck
 from waveform_cases import CASES
@@ -401,9 +401,7 @@ every_parameter = pytest.mark.parametrize(("device", "spec"), PARAMETERS, ids=[f
 
 
 @every_parameter
-def test_every_parameter_has_a_usual_range_with_its_source_inside_the_legal_one(
-    device: str, spec: ParameterSpec
-) -> None:
+def test_every_parameter_has_a_usual_range_with_its_source_inside_the_legal_one(device, spec):
     assert spec.usual is not None
     assert spec.least <= spec.usual.least < spec.usual.most <= spec.most
     assert len(spec.usual.source) > 10

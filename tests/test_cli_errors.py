@@ -41,9 +41,7 @@ def folder(command: Command, tmp_path: Path) -> Path:
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
 )
-def test_bad_input_gets_a_sentence_and_leaves_nothing(
-    command: Command, folder: Path, arguments: list[str], said: str
-) -> None:
+def test_bad_input_gets_a_sentence_and_leaves_nothing(command, folder, arguments, said):
     before = tree(folder)
     result = command(*arguments)
     assert (result.code, result.out) == (2, "")
@@ -88,9 +86,7 @@ def test_arguments_are_checked_before_files(command: Command, words: str, said: 
 
 
 @pytest.mark.parametrize("out", ["/proc/new", "/proc", f"new/{'x' * 300}/y", "x/y"])
-def test_a_folder_that_cannot_be_made_is_told(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
-) -> None:
+def test_a_folder_that_cannot_be_made_is_told(command, tmp_path, monkeypatch, out):
     if out.startswith("/proc") and not Path("/proc/self").exists():
         pytest.skip("this system has no /proc")
     monkeypatch.setattr("fingerspice.solve.simulation.simulate", lambda *a, **k: pytest.fail("it ran"))

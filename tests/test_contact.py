@@ -81,9 +81,7 @@ def test_the_universal_curve_is_exact_to_1e_13_for_any_legal_exponents(m: float,
     (200.0, 40.4716667764, 30.5985185509, 0.442317197142, 0.282695159143),
 ])  # fmt: skip
 @pytest.mark.parametrize("finger", ["python", "netlist"])
-def test_table_1_gives_golden_areas_and_forces(
-    finger: str, u: float, a0: float, a: float, f_el: float, f_t: float
-) -> None:
+def test_table_1_gives_golden_areas_and_forces(finger, u, a0, a, f_el, f_t):
     c = PAPER if finger == "python" else build_stack(table1()).contact
     assert c is not None
     assert float(c.area_adhesive(u)) * MM2 == pytest.approx(a0, abs=5.1e-11)
@@ -145,9 +143,7 @@ def test_any_fingers_area_agrees_with_equations_1_to_4_solved_to_40_digits(p: Pa
     u=st.floats(0.0, 1000.0),
     d=st.floats(0.1e-6, 10e-6),
 )
-def test_hertz_exponents_give_the_area_of_jkr_theory(
-    radius: float, e_star: float, force: float, u: float, d: float
-) -> None:
+def test_hertz_exponents_give_the_area_of_jkr_theory(radius, e_star, force, u, d):
     m, n, alpha, beta = jkr_parameters(radius, e_star)
     c = Contact(d, 1.0, force, 0.0, alpha, m, beta, n, 0.0)
     w = 8.854e-12 * u**2 / (2.0 * d)

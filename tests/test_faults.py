@@ -15,16 +15,9 @@ from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.base.files import write_aside
 from processes import ended, no_room, start
-from scenes import CIRCUITS, cases
+from scenes import CIRCUITS, cases, listed
 
-COMMANDS = {
-    "run": (["run", "pad.cir", "--overwrite", "--out", "out"], ["pad.nc", "pad.png"]),
-    "csv": (["run", "pad.cir", "--overwrite", "--out", "out", "--csv", "--no-plot"], ["pad.csv"]),
-    "ac": (["ac", "pad.cir", "--overwrite", "--out", "out"], ["pad_ac.csv", "pad_ac.png"]),
-    "compare": (["compare", "pad.cir", "--overwrite", "--out", "out"], ["pad_compare.png"]),
-    "export": (["export", "pad.cir", "-o", "out/spice.cir"], ["spice.cir"]),
-    "figures": (["figures", "--out", "out", "--only", "2"], ["fig2.csv", "fig2.png"]),
-}
+COMMANDS = dict(listed("interrupted"))
 # The command, with what ends it just where it would hurt: PLACE is patched to strike when called for the N-th time.
 STRUCK = """
 import os, pathlib, sys
@@ -140,10 +133,7 @@ def test_at_any_moment_a_signal_leaves_whole_files_or_none(folder: Path, right: 
     (signal.SIGINT, "replace", 2, ["pad.nc"]),
     (signal.SIGTERM, "replace", 1, []),
 ])  # fmt: skip
-def test_while_a_file_is_written_too(
-    folder: Path, right: dict[str, bytes], command: Command, number: signal.Signals, place: str, count: int,
-    done: list[str],
-) -> None:  # fmt: skip
+def test_while_a_file_is_written_too(folder, right, command, number, place, count, done):
     out = folder / "out"
     out.mkdir()
     for file in right:

@@ -148,9 +148,7 @@ def test_a_file_holds_what_a_deck_includes_and_plays(tmp_path: Path) -> None:
         assert (again.tran, again.text, again.charge_law) == (circuit.tran, circuit.text, circuit.charge_law)
 
 
-def test_a_source_too_long_for_a_file_leaves_a_circuit_without_elements(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_source_too_long_for_a_file_leaves_a_circuit_without_elements(tmp_path, monkeypatch):
     monkeypatch.setattr(runfile, "MOST_NUMBERS", 399)
     run = fs.simulate(table1("DC 0"), sources=fs.Samples(RECORDING, 8000.0), t_stop=2e-3, area="frozen")
     said = "its sources have 400 numbers, and a file keeps at most 399.; its elements are left out"

@@ -161,9 +161,7 @@ CHARGES = [
 
 
 @pytest.mark.parametrize(("r_coat", "r_gap", "rtol", "off", "said", "shape", "law"), CHARGES)
-def test_the_charge_is_as_exact_as_its_error_says_whatever_the_leaks(
-    r_coat: float, r_gap: float, rtol: float, off: float, said: float, shape: str, law: str
-) -> None:
+def test_the_charge_is_as_exact_as_its_error_says_whatever_the_leaks(r_coat, r_gap, rtol, off, said, shape, law):
     plain, peak = ref.table1_layers(100.0), lambda x: np.abs(x).max()
     layers = (ref.Layer(plain[0].c, r_total=r_coat), ref.Layer(plain[1].c, r_total=r_gap), plain[2])
     expected = charged(shape, layers, law)
@@ -302,9 +300,7 @@ def test_coupled_response_equals_the_reference_to_1e_9(scene: str, law: str) -> 
 @pytest.mark.parametrize("deck", ["fingerpad.cir", "amplifier.cir"])
 @pytest.mark.parametrize("options", [{}, {"area": "frozen"}, {"method": "radau"}, {"charge_law": "mobile"}], ids=str)
 @pytest.mark.parametrize("periods", [3, 7])
-def test_a_run_that_ends_at_a_jump_but_for_rounding_ends_after_it(
-    deck: str, options: dict[str, Any], periods: int
-) -> None:
+def test_a_run_that_ends_at_a_jump_but_for_rounding_ends_after_it(deck, options, periods):
     # Three periods of 0.2 ms are 0.6000000000000001 ms: the source is past its jump there, and so is the gap.
     circuit = fs.read_netlist(CIRCUITS / deck).replace({"Vdrive": fs.Square(200.0, 5000.0)})
     stop = periods * 2e-4

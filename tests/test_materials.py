@@ -106,9 +106,7 @@ def written(path: Path, head: str, columns: tuple[np.ndarray, ...], mark: str = 
     ],
 )
 @pytest.mark.parametrize("mark", [",", ";", "\t"])
-def test_a_header_says_what_the_columns_are(
-    tmp_path: Path, head: str, columns: tuple[np.ndarray, ...], mark: str
-) -> None:
+def test_a_header_says_what_the_columns_are(tmp_path, head, columns, mark):
     path = written(tmp_path / "skin.csv", head.replace(",", mark), columns, mark)
     np.testing.assert_allclose(read_table(path), TABLE, rtol=1e-12)
 

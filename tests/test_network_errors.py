@@ -21,9 +21,7 @@ def judged() -> list[Beside]:
 
 
 @pytest.mark.parametrize("quantity", network_errors.QUANTITIES)
-def test_stated_errors_cover_the_true_ones_on_95_percent_of_random_networks_and_are_not_far_above(
-    judged: list[Beside], quantity: str
-) -> None:
+def test_stated_errors_cover_the_true_ones_on_95_percent_of_random_networks_and_are_not_far_above(judged, quantity):
     these = [x for x in judged if x.quantity == quantity]
     assert network_errors.coverage(these) >= 0.95
     # A third of what is stated would not do, and nine of ten are at most ten times the true ones.

@@ -53,9 +53,7 @@ def test_a_picture_is_shown_once(outputs: list[list[Any]], number: int) -> None:
 
 
 @pytest.mark.parametrize(("number", "count"), [(15, 1), (16, 2), (17, 2), (18, 0)])
-def test_pictures_in_a_loop_or_before_a_semicolon_are_shown_once_each(
-    outputs: list[list[Any]], number: int, count: int
-) -> None:
+def test_pictures_in_a_loop_or_before_a_semicolon_are_shown_once_each(outputs, number, count):
     pictures = [shown([output])["image/png"] for output in outputs[number]]
     assert [len(picture) > 10_000 for picture in pictures] == [True] * count
 

@@ -255,9 +255,7 @@ def test_a_time_response_is_the_end_of_a_long_run() -> None:
 @pytest.mark.parametrize(
     ("f", "ratio", "gap"), [(10.0, 3.04, -1.97), (100.0, 4.07, -1.95), (1000.0, 10.05, -1.79), (10000.0, 10.93, -1.71)]
 )
-def test_how_the_force_goes_with_skin_area_and_gap(
-    trends: dict[tuple[str, float], tuple[float, float]], f: float, ratio: float, gap: float
-) -> None:
+def test_how_the_force_goes_with_skin_area_and_gap(trends, f, ratio, gap):
     """About linear in skin thickness and area, which matters more, and about as the inverse square of the gap."""
     (area, bent_area), (skin, bent_skin), (thin, bent_gap) = (trends[name, f] for name in ("area", "d_sc", "d_a"))
     # Off the best straight line by 6 % of the change at most for the skin (at 10 Hz), 1.2 % for the area.

@@ -110,9 +110,7 @@ def test_the_reading_of_equation_7_reaches_the_coupled_area() -> None:
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(amplitude=st.floats(0.0, 1e4), steepness=st.floats(-0.9, 3.0), reach=st.floats(1.0, 1e3))
 @example(amplitude=2.0, steepness=2.0, reach=1.0)  # Iterating on the area swings between two values.
-def test_the_coupled_area_solves_its_equation_for_any_monotone_area_and_gain(
-    amplitude: float, steepness: float, reach: float
-) -> None:
+def test_the_coupled_area_solves_its_equation_for_any_monotone_area_and_gain(amplitude, steepness, reach):
     def area_of(u: float) -> float:
         return 1.0 / (1.0 + (u / reach) ** 2)
 

@@ -180,9 +180,7 @@ def test_the_comparison_shows_its_table_which_has_room_for_the_names_of_several_
         assert all(left.x1 < right.x0 for left, right in itertools.pairwise(texts))
 
 
-def test_a_picture_has_150_dots_an_inch_or_more_and_a_folder_that_can_be_written(
-    sine: fs.Solution, tmp_path: Path
-) -> None:
+def test_a_picture_has_150_dots_an_inch_or_more_and_a_folder_that_can_be_written(sine, tmp_path):
     figure = traces.plot_solution(sine)
     with Image.open(drawing.save(figure, tmp_path / "new" / "run.png")) as image:
         assert image.format == "PNG"

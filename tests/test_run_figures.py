@@ -272,9 +272,7 @@ def test_where_the_recorded_steps_fill_their_arrays_changes_nothing(name: str, m
 @pytest.mark.parametrize(
     "source", [fs.Square(200.0, 100.0), fs.Square(200.0, 100.0, delay=1e-3), fs.Sine(200.0, 100.0)]
 )
-def test_a_period_that_ends_with_a_jump_is_looked_at_a_few_times(
-    source: fs.Waveform, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_period_that_ends_with_a_jump_is_looked_at_a_few_times(source, monkeypatch):
     # By rounding of the time the jump fell into the last panel, which was halved two thousand times.
     looks = []
     look = steps.Recorded.values_at
@@ -302,9 +300,7 @@ def test_weights_of_outputs_integrate_cubics_between_jumps_and_lines_where_point
 
 
 @pytest.mark.parametrize("area", ["coupled", "frozen"])
-def test_every_attribute_is_the_summarys_entry_whichever_is_asked_for_first(
-    area: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_attribute_is_the_summarys_entry_whichever_is_asked_for_first(area, monkeypatch):
     made = []
     monkeypatch.setattr(Figures, "_made", lambda self, *key, make=Figures._made: made.append(key) or make(self, *key))
     run, other = (fs.simulate(table1(), area=area, t_stop=0.02) for _ in range(2))

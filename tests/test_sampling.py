@@ -123,9 +123,7 @@ def test_a_function_that_works_in_place_leaves_the_times_as_they_are() -> None:
 @pytest.mark.parametrize("kind", [np.float32, np.float16])
 @pytest.mark.parametrize("rtol", [1e-8, 1e-4])
 @pytest.mark.parametrize("shape", ["sine", "chirp", "sum", "clock"])
-def test_coarser_numbers_than_doubles_are_taken_as_they_are_and_their_rounding_is_stated(
-    kind: type[np.floating], rtol: float, shape: str
-) -> None:
+def test_coarser_numbers_than_doubles_are_taken_as_they_are_and_their_rounding_is_stated(kind, rtol, shape):
     def exact(t):
         if shape == "chirp":
             return 120.0 * np.sin(2.0 * np.pi * (50.0 + 4000.0 * t) * t)
@@ -301,9 +299,7 @@ def test_noise_as_a_source_is_refused_at_once(run) -> None:
         run(table1(), sources={"Vdrive": noise})
 
 
-def test_a_function_that_never_becomes_smooth_is_refused_after_a_bounded_number_of_calls(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_function_that_never_becomes_smooth_is_refused_after_a_bounded_number_of_calls(monkeypatch):
     monkeypatch.setattr(sampling, "_MOST_DEEP", cases(10_000, 1_000))
     counted = Counted(rough)
     with pytest.raises(fs.InputError, match=r"too rough to be followed near t = .*give fs\.Samples\(values, rate\)"):

@@ -13,7 +13,6 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 import fingerspice as fs
-from commands import Command
 from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic, place, put_beside
 from scenes import CIRCUITS, DECKS, cases, shipped, table1
 
@@ -163,9 +162,7 @@ def test_the_picture_of_a_run_has_the_schematic_about_as_high_on_its_right() -> 
     assert box.width * whole.bbox.width / (box.height * whole.bbox.height) == pytest.approx(wide / high, rel=0.01)
 
 
-def test_run_writes_the_schematic_beside_its_picture_and_keeps_that_of_another_circuit(
-    command: Command, tmp_path: Path
-) -> None:
+def test_run_writes_the_schematic_beside_its_picture_and_keeps_that_of_another_circuit(command, tmp_path):
     run = ("run", str(CIRCUITS / "fingerpad.cir"), "--schematic", "--stop", "10m", "--out", str(tmp_path))
     file = tmp_path / "fingerpad_schematic.svg"
     for _ in range(2):

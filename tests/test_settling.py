@@ -166,9 +166,7 @@ def creeping(law: str) -> ref.Transient:
 
 @every_law
 @pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids=["stack", "network"])
-def test_what_a_repeated_period_is_off_is_in_every_stated_error(
-    law: str, beside: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_repeated_period_is_off_is_in_every_stated_error(law, beside, monkeypatch):
     # Taken for settled while it still moves hundreds of times more than a step may be off, and the coating's charge
     # takes its time: what is left to move is then all the error there is.
     monkeypatch.setattr(stepping, "_SHARE", 1e2)

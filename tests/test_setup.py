@@ -58,9 +58,7 @@ INSTALL = "echo $@ >> {{log}}; [ $1 = update ] || cp {{true}} {{here}}/{}"
         ({"ngspice": "exit 0"}, ""),
     ],
 )
-def test_programs_are_installed_where_that_takes_no_question(
-    tmp_path: Path, scripts: dict[str, str], said: str
-) -> None:
+def test_programs_are_installed_where_that_takes_no_question(tmp_path, scripts, said):
     log, true = tmp_path / "log", shutil.which("true")
     filled = {
         k: v.format(log=log, here=tmp_path, true=true) for k, v in ({"chromium": "exit 0"} | scripts).items() if v

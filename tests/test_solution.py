@@ -293,9 +293,7 @@ def test_a_failed_run_keeps_what_came_before_it(tmp_path: Path) -> None:
     assert [s.name for s in fs.Status if "success" in s.value] == ["SUCCESS"]
 
 
-def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full_or_writing_is_interrupted(
-    square: fs.Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full_or_writing_is_interrupted(square, tmp_path, monkeypatch):
     def broken_off(path: Path, write_to: Any) -> Path:
         def half(target: Path) -> None:
             target.write_text("half of a file")

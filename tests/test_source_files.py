@@ -197,9 +197,7 @@ def test_a_malformed_file_gives_the_same_values_or_the_same_refusal_at_once_and_
 
 @pytest.mark.parametrize("size", [0xFFFFFFFF, 0x7FFFF000])
 @pytest.mark.parametrize("kind", ["i2", "i3", "f8"])
-def test_a_stream_whose_header_does_not_know_its_end_is_read_to_the_end_of_the_file(
-    kind: str, size: int, tmp_path: Path
-) -> None:
+def test_a_stream_whose_header_does_not_know_its_end_is_read_to_the_end_of_the_file(kind, size, tmp_path):
     sound, live = tmp_path / "sound.wav", tmp_path / "live.wav"
     sound.write_bytes(pieced(kind))
     live.write_bytes(pieced(kind, size=size, whole=0xFFFFFFFF))
@@ -332,9 +330,7 @@ def test_a_file_of_a_pwl_alternates_times_and_values(text: str, folder: Path) ->
 
 
 @pytest.mark.parametrize(("text", "given", "said"), listed("tables"), ids=[said for *_, said in listed("tables")])
-def test_what_is_no_table_is_refused_with_its_line(
-    text: str, given: dict[str, object], said: str, in_folder: None
-) -> None:
+def test_what_is_no_table_is_refused_with_its_line(text, given, said, in_folder):
     Path("a.csv").write_text(text)
     assert said in refusal(fs.PWL.from_table, "a.csv", **given)
 

@@ -105,9 +105,7 @@ def test_a_periodic_source_has_the_reference_s_periodic_state(name: str, law: st
 @every_law
 @pytest.mark.parametrize("name", ["offset", "duty", "AM"])
 @pytest.mark.parametrize("rtol", [1e-6, 1e-10])
-def test_another_period_by_another_method_changes_no_more_than_the_defect_says(
-    name: str, law: str, rtol: float
-) -> None:
+def test_another_period_by_another_method_changes_no_more_than_the_defect_says(name, law, rtol):
     waveform, _ = SCENES[name]
     circuit = table1().replace({"Vdrive": waveform})
     state = fs.steady_state(circuit, charge_law=law, rtol=rtol)
@@ -178,9 +176,7 @@ def little(r_coat: float, r_gap: float, law: str) -> tuple[np.ndarray, ref.Trans
 @pytest.mark.parametrize(("r", "law"), by_turns([(25e6, 1.7e3), (2e5, 1e3), (5e6, 1e4)]))
 @pytest.mark.parametrize("rtol", [1e-5, 1e-10])
 @pytest.mark.parametrize("way", ["steady_state", "simulate", "simulate by radau"])
-def test_a_gap_that_takes_little_of_the_voltage_has_its_own_error_met(
-    way: str, rtol: float, r: tuple[float, float], law: str
-) -> None:
+def test_a_gap_that_takes_little_of_the_voltage_has_its_own_error_met(way, rtol, r, law):
     # Of 150 V a few tenths of a volt are left, or one: what is asked is relative to that.
     circuit = table1("SIN(20 150 139)", coat={"r": r[0]}, gap={"r": r[1]})
     t, want = little(*r, law)
@@ -381,9 +377,7 @@ HALVED = [
 
 
 @pytest.mark.parametrize(("name", "waveform", "law"), HALVED)
-def test_a_state_found_by_half_a_period_is_that_of_the_whole_one(
-    name: str, waveform: fs.Waveform, law: str | None
-) -> None:
+def test_a_state_found_by_half_a_period_is_that_of_the_whole_one(name, waveform, law):
     circuit = shipped(name) if name else table1()
     half = fs.steady_state(circuit, sources=waveform, charge_law=law, rtol=1e-10)
     # A product with a constant is a source whose half waves nobody vouches for.

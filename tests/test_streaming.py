@@ -207,9 +207,7 @@ def test_a_run_that_fails_gives_what_came_before() -> None:
 @pytest.mark.parametrize("order", ["little", "big"])
 @pytest.mark.parametrize(("bits", "kind"), [(8, 1), (16, 1), (24, 1), (32, 1), (32, 3), (64, 3)])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_parts_of_a_file_are_those_of_the_whole(
-    bits: int, kind: int, channels: int, order: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parts_of_a_file_are_those_of_the_whole(bits, kind, channels, order, tmp_path, monkeypatch):
     monkeypatch.setattr(samples, "AT_ONCE", 50)
     rng = np.random.default_rng(bits)
     if kind == 3:
@@ -401,9 +399,7 @@ def test_a_store_of_an_earlier_version_says_that_it_has_no_checksums(few: Comman
     assert said in few(*FEW).lines[-1]
 
 
-def test_options_of_streams_are_checked_and_without_zarr_a_store_says_how_to_get_it(
-    scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_options_of_streams_are_checked_and_without_zarr_a_store_says_how_to_get_it(scene, command, monkeypatch):
     monkeypatch.chdir(scene)
     for arguments, said in (
         ("--chunk 1", "--chunk, --signals and --netcdf go with --stream"),

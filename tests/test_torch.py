@@ -56,9 +56,7 @@ def means() -> Any:
     ids=["runs", "batch"],
 )
 @pytest.mark.parametrize("periodic", [False, True])
-def test_gradcheck_backward_and_forward(
-    shares: Any, periodic: bool, outputs: tuple[str, ...], how: dict[str, Any]
-) -> None:
+def test_gradcheck_backward_and_forward(shares, periodic, outputs, how):
     run = by_shares(fs.torch.Simulator(table1(), (), outputs, periodic=periodic, rtol=1e-9, **how))
     batched = "t" in how
     shares = shares[:1] if batched else shares

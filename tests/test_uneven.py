@@ -44,9 +44,7 @@ EVERY = [(skin, law, (1e-3, 1e-5, 1e-7)) for skin in ("SKIN", "SKIN_DISPERSIVE")
 
 @pytest.mark.parametrize(("skin", "law", "rtols"), EVERY if cases(1, 0) else FEW)
 @pytest.mark.parametrize("seed", range(cases(4, 1)))
-def test_points_at_uneven_times_run_one_step_each_with_the_error_stated(
-    seed: int, skin: str, law: str, rtols: tuple[float, ...]
-) -> None:
+def test_points_at_uneven_times_run_one_step_each_with_the_error_stated(seed, skin, law, rtols):
     circuit, (t, v) = circuit_of(skin), points(seed)
     for run in compared(circuit, fs.PWL(t, v), t, *rtols, charge_law=law):
         assert run.method == "relaxation"
