@@ -9,7 +9,7 @@ import analytic as ref
 import fingerspice as fs
 from batches import alike, check, population, singles, singly
 from fingerspice.circuit.circuit import Circuit
-from scenes import cases, listed, shipped, table1
+from scenes import DECKS, cases, listed, shipped, table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 OUTPUTS = ("f_el_mean", "f_el_mean_periodic", "f_t_rms", "u_gap_rms")
@@ -144,13 +144,7 @@ def test_stacks_of_other_layers(layers: str, outputs: tuple[str, ...], rtol: flo
 
 
 DISPERSIVE = "Xskin skin 0 area SKIN_DISPERSIVE d=350u"
-STACK = """sources of several tones, and the dispersive skin
-{source}
-Xcoat in top area LAYER d=1u eps_r=3.9 r=0.2meg
-Xgap top skin area GAP d=3.5u r=1meg
-{skin}
-.tran 1u {stop} uic
-"""
+STACK = (DECKS / "several_tones.cir").read_text()
 SOURCES = {
     "three sines": ("V1 a 0 SIN(0 150 100)\nV2 b a SIN(0 40 300 0 0 60)\nV3 b in SIN(0 30 500 0 0 -20)", "25m"),
     "AM": ("Vdrive in 0 SIN(0 200 2k)", "50m"),

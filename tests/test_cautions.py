@@ -19,7 +19,7 @@ from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.describe import course_warnings, energy_outside, skin_error
 from fingerspice.circuit.devices import DEVICES, REST_AREA, SOURCES
 from fingerspice.waveforms.waveform import as_waveform
-from scenes import deck, finger, table1, table1_deck
+from scenes import deck, finger, listed, table1, table1_deck
 from waveform_cases import CASES
 
 every_kind = pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids=["stack", "network"])
@@ -237,45 +237,25 @@ def said_by(make: Callable[[], object]) -> list[str]:
 
 # What is said
 
-#: A change of the deck, its path and value, what the warning says, and what was likely meant.
-SLIPS = {
-    "gap in m": (("d=3.5u", "d=3.5"), ("Xgap.d", 3.5), "Xgap d is 3.5 m, outside 10 nm to 100 um", "3.5u"),
-    "gap in mm": (("d=3.5u", "d=3.5m"), ("Xgap.d", 3.5e-3), "Xgap d is 3.5 mm, outside 10 nm to 100 um", "3.5u"),
-    "skin in nm": (("d=350u", "d=350n"), ("Xskin.d", 350e-9), "Xskin d is 350 nm, outside 1 um to 2 mm", "350u"),
-    "coating in m": (("d=1u", "d=1"), ("Xcoat.d", 1.0), "Xcoat d is 1 m, outside 10 nm to 10 mm", "1m or 1u"),
-    "load in mN": (("fn=0.5 mu=0.3", "fn=50 mu=0"), None, "Xgap fn is 50 N, outside 1 mN to 49.9 N", "50m"),
-    "alpha too large": (
-        ("alpha=54.4", "alpha=54.4meg"), ("Xgap.alpha", 54.4e6), "Xgap alpha is 5.44e+07 mm^2/N^m, outside", "54.4",
-    ),
-    "permittivity": (("eps_r=3.9", "eps_r=0.39"), ("Xcoat.eps_r", 0.39), "Xcoat eps_r is 0.39, outside 1 to", None),
-    "fixed area": (("c2=5000", "c2=5000 a_fix=1u"), ("Xgap.a_fix", 1e-6), "Xgap a_fix is 1e-06 mm^2, outside 0.1", "1"),
-    "resistance": (("r=0.2meg", "r=0.2"), ("Xcoat.r", 0.2), "Xcoat r is 200 mohm, outside", "200, 200k or 200meg"),
-    "frequency": (("SIN(0 200 100)", "SIN(0 200 100meg)"), None, "Vdrive frequency is 100 MHz, outside 10 mHz", "100k"),
-    "voltage": (("SIN(0 200 100)", "SIN(0 200k 100)"), None, "Vdrive amplitude is 200 kV, outside 0 V to 10 kV", "200"),
-    "skin's f": (("f=100", "f=1meg"), ("Xskin.f", 1e6), "Xskin f is 1 MHz, outside 10 Hz to 100 kHz", "1k"),
-}  # fmt: skip
-each_slip = pytest.mark.parametrize("name", SLIPS)
+#: Name, a change of the deck, its path and value if it is one in Python, what the warning says, and what was meant.
+SLIPS = listed("slips")
 
 
-@each_slip
-def test_a_likely_slip_is_named_with_its_place_the_range_and_what_was_meant(name: str) -> None:
-    change, _, expected, meant = SLIPS[name]
+@pytest.mark.parametrize(("change", "expected", "meant"), [(change, *said) for _, change, _, *said in SLIPS])
+def test_a_likely_slip_is_named_with_its_place_the_range_and_what_was_meant(change, expected: str, meant: str) -> None:
     circuits: list[fs.Circuit] = []
-    (said,) = said_by(lambda: circuits.append(fs.parse_netlist(edited(change), "deck.cir")))
+    (said,) = said_by(lambda: circuits.append(fs.parse_netlist(edited(tuple(change)), "deck.cir")))
     place, _, text = said.partition(": ")
     assert re.fullmatch(r"deck\.cir:[34567]:\d+", place)
     assert text.startswith(expected)
     assert "the usual range (" in text
-    assert ("meant?" in text) == (meant is not None)
-    if meant is not None:
-        assert f"; was {meant}" in text
+    assert ("meant?" in text) == (meant != "")
+    assert meant == "" or f"; was {meant}" in text
     assert circuits[0].warnings == (said,)
 
 
-@pytest.mark.parametrize("name", [name for name, slip in SLIPS.items() if slip[1] is not None])
-def test_a_change_in_python_and_on_the_command_line_is_warned_about_as_in_the_deck(name: str, command: Command) -> None:
-    _, change, expected, _ = SLIPS[name]
-    assert change is not None
+@pytest.mark.parametrize(("change", "expected"), [(change, said) for _, _, change, said, _ in SLIPS if change])
+def test_a_change_in_python_and_on_the_command_line_is_warned_about_as_in_the_deck(change, expected, command) -> None:
     path, value = change
     changed: list[fs.Circuit] = []
     (said,) = said_by(lambda: changed.append(table1().replace({path: value})))

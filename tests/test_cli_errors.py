@@ -103,9 +103,6 @@ def test_a_folder_that_cannot_be_made_is_told(command, tmp_path, monkeypatch, ou
     assert tree(tmp_path) == before
 
 
-# The command itself, in its own process
-
-
 def process(*arguments: str, folder: Path, **how: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(arguments, cwd=folder, capture_output=True, text=True, timeout=60, **how)
 

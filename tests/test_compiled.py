@@ -198,9 +198,6 @@ def test_killed_while_it_keeps_compiled_code_it_works_the_next_time(copy: Path) 
     assert area(copy) == (0, [], out)
 
 
-# A change of any source ---------------------------------------------------------------------------------------------
-
-
 def test_compiling_is_announced_by_one_line_and_repeated_only_after_a_change_of_its_sources(copy: Path) -> None:
     def change(*names: str) -> None:
         for name in names:
@@ -322,9 +319,6 @@ def test_what_is_built_on_private_classes_of_numba_does_what_it_is_for(tmp_path:
     command = [sys.executable, "-c", code]
     found = [subprocess.check_output(command, text=True, env=environment) for _ in range(2)]
     assert found == ["0\n", "1\n"]
-
-
-# Tuples passed by their address --------------------------------------------------------------------------------------
 
 
 class Outer(NamedTuple):

@@ -199,9 +199,6 @@ def test_work_grows_with_the_deck_and_not_faster() -> None:
     assert calls(1500, "long") < 3.05 * calls(500, "short")
 
 
-# Names of parameters in nested calls mean what they mean in ngspice 39, or are refused
-
-
 def theirs(body: str, folder: Path) -> float:
     """The resistance between a and 0 that ngspice finds, ohm."""
     text = f"a resistance\n{body}\nI1 0 a DC 1\n.op\n.control\nrun\nset numdgt=12\nprint v(a)\nquit 0\n.endc\n.end\n"
@@ -273,9 +270,6 @@ def test_a_value_whose_name_ngspice_takes_inside_is_refused(call: str, said: str
 def test_a_value_that_is_the_same_inside_is_taken(tmp_path: Path) -> None:
     body = ".param w=7\n.subckt s a b w=4 v=1\nR1 a b {v*w}\n.ends\nX1 a 0 s w={w} v={w+1}"
     assert ours(body) == theirs(body, tmp_path) == 56.0
-
-
-# Files
 
 
 def test_local_files_are_included_and_named_in_places(tmp_path: Path) -> None:

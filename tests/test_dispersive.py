@@ -49,9 +49,6 @@ def gap_gain(f: np.ndarray) -> np.ndarray:
     return np.asarray(z[1] / (z[0] + z[1] + D / (y * AREA)))
 
 
-# The ladder -------------------------------------------------------------------------------------------------
-
-
 def test_the_ladder_is_equations_18_and_19_over_the_band() -> None:
     misfit = np.abs(SKIN_LADDER.admittivity(BAND) / admittivity(BAND) - 1.0)
     assert np.sqrt(np.mean(misfit**2)) <= 0.021
@@ -84,9 +81,6 @@ def test_the_libraries_hold_the_cells_of_the_package(library: str) -> None:
     assert body is not None
     slabs = re.findall(r"SLAB d=\{d\} eps_r=(\S+) rho=(\S+)", body.group())
     np.testing.assert_allclose(np.array(slabs, float).T, SKIN_LADDER.cells(), rtol=1e-12)
-
-
-# Fits -------------------------------------------------------------------------------------------------------
 
 
 def test_debye_terms_are_found_again() -> None:
@@ -141,9 +135,6 @@ def test_a_fitted_material_in_a_netlist_is_the_device_of_the_same_ladder(law: st
     t = np.linspace(0.0, 0.02, 101)
     a, b = (fs.simulate(c, t_stop=0.02, t_eval=t, rtol=1e-9, charge_law=law) for c in (own, dispersive()))
     assert np.abs(a.u_gap - b.u_gap).max() <= 1e-8 * np.abs(b.u_gap).max()
-
-
-# Tiers ------------------------------------------------------------------------------------------------------
 
 
 def periodic(waveform: fs.Waveform, t: np.ndarray) -> np.ndarray:
@@ -230,9 +221,6 @@ def test_the_periodic_state_is_reached_from_the_operating_point_too(law: str) ->
     assert np.abs(late.u_gap - state.solution.u_gap[:-1]).max() <= 3e-8 * peak
 
 
-# What the plan picks ----------------------------------------------------------------------------------------
-
-
 def test_a_loose_error_lets_a_sine_take_the_skin_at_its_frequency() -> None:
     circuit = dispersive()
     loose = fs.simulate(circuit, rtol=0.1, t_stop=0.05)
@@ -251,9 +239,6 @@ def test_no_single_frequency_stands_for_a_broad_spectrum_and_a_plain_skin_is_not
         assert any("skin dispersive" in r for r in plan.reasons)
     plan = fs.plan(fs.parse_netlist(table1_deck()), rtol=0.1)
     assert not any("skin" in r for r in plan.reasons)
-
-
-# Warnings ---------------------------------------------------------------------------------------------------
 
 
 OUTSIDE = {

@@ -30,9 +30,6 @@ def read(*changes: tuple[str, str]) -> tuple[fs.Circuit, list[str]]:
     return circuit, [str(w.message) for w in caught]
 
 
-# LTspice
-
-
 def test_what_ltspice_saves_loads_and_is_the_same_circuit_as_ours() -> None:
     # As LTspice XVII saves a schematic: Latin-1, CRLF, SINE, two numbers less in .tran, parasitics, parts' data.
     theirs = fs.read_netlist(DECKS / "ltspice.net")
@@ -125,9 +122,6 @@ def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
     assert fs.read_netlist(path)["Xgap"].values["d"] == 3.5e-6
 
 
-# R, C and GAP as ngspice takes them
-
-
 @pytest.mark.parametrize(("line", "value"), [
     ("R9 drive 0 r=10k", 1e4), ("R9 drive 0 r={g}", 1e4), ("R9 drive 0 R={2*5k}", 1e4), ("R9 drive 0 10k m=4", 2.5e3),
     ("R9 drive 0 r=10k m=0.5", 2e4), ("R9 drive 0 resistance=10k", 1e4), ("C9 drive 0 c=1n", 1e-9),
@@ -158,9 +152,6 @@ def test_a_gap_has_the_librarys_defaults_which_are_table_1() -> None:
     assert fs.simulate(short, area="frozen", t_stop=1e-3).area[0] == pytest.approx(float(ref.area(0.0)), rel=1e-12)
 
 
-# What is said
-
-
 @pytest.mark.parametrize("word", ELSEWHERE)
 def test_a_directive_of_another_simulator_says_the_way_here(word: str) -> None:
     with pytest.raises(fs.InputError) as caught:
@@ -188,9 +179,6 @@ RIGHT = [
 def test_a_decimal_comma_is_named_and_a_comma_that_separates_is_right(line: str, said: str | None) -> None:
     found = decimal_comma(line)
     assert found is None if said is None else (found or "").endswith(said)
-
-
-# The library beside the deck
 
 
 @pytest.mark.parametrize("name", LIBRARIES.values())
@@ -225,9 +213,6 @@ def test_a_library_outside_the_decks_folder_is_not_looked_at(tmp_path: Path) -> 
     assert fs.read_netlist(path).warnings == ()
     path.write_text(DECK)
     assert fs.read_netlist(path).warnings == ()
-
-
-# Files of schematic tools --------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:.*(has no effect here|usual range)")

@@ -32,20 +32,12 @@ from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS, WAVEFORMS
 from fingerspice.explorer.scene import EXAMPLES, as_deck, as_python, scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
-from scenes import cases, listed
+from scenes import DECKS, cases, listed
 
 ROOT = Path(__file__).parents[1]
 SINE = EXAMPLES[0].deck
 BY_NAME = {e.name: e for e in EXAMPLES}
-OWN = """Its own
-.include fingerspice.lib
-Vdrive  drive 0          PWL FILE=drive.csv
-Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg
-Xgap    top   skin area  GAP   r=1meg
-Xskin   skin  0    area  SKIN_DISPERSIVE d=350u
-.tran 10u 20m uic
-.end
-"""
+OWN = (DECKS / "own.cir").read_text()
 
 
 @pytest.fixture(scope="module")

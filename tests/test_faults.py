@@ -90,9 +90,6 @@ def rerun(command: Command, folder: Path, right: dict[str, bytes]) -> None:
     assert {n: c for n, c in written(folder / "out").items() if not n.startswith(".fingerspice-")} == right
 
 
-# Signals
-
-
 def strike(folder: Path, name: str, number: int, delay: float, right: dict[str, bytes]) -> int:
     """Start a command, send it a signal `delay` s after it minds them, and look at what it leaves; its exit code."""
     process = start(folder, *COMMANDS[name][0])
@@ -209,9 +206,6 @@ def test_a_command_without_ctrl_c_and_standard_output_writes_its_files(folder: P
     assert written(folder / "out") == right
 
 
-# No room
-
-
 @pytest.mark.parametrize(("name", "size", "first", "before", "found"), [
     ("run", 0, "pad.nc", [], "electroadhesive force"),
     ("csv", 5000, "pad.csv", [], "electroadhesive force"),
@@ -265,9 +259,6 @@ def test_what_nobody_reads_changes_no_exit_code(folder: Path, arguments: list[st
         with open("/dev/full", "w") as full:
             process = start(folder, *arguments, stderr=full, stdout=subprocess.DEVNULL)
             assert process.wait(60) == expected
-
-
-# What stands where an output should go
 
 
 @pytest.mark.parametrize("name", ["run", "ac", "compare", "figures"])

@@ -191,9 +191,6 @@ def test_a_node_reached_by_capacitors_only_has_no_operating_point(lines: list[st
     assert np.abs(solution.u_gap - expected.u_gap).max() <= 1e-8 * np.abs(expected.u_gap).max()
 
 
-# The failure record ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("beside", ["", "Rload drive 0 1meg"], ids=["stack", "network"])
 def test_a_fold_says_when_where_why_and_what_to_change(beside: str) -> None:
     circuit = table1(gap={"d": "10n"}, extra=beside, tran="20u 10m uic")
@@ -275,9 +272,6 @@ def test_a_fold_soon_after_a_jump_at_the_start_is_met() -> None:
     times = [run.failure.t for run in runs if run.failure is not None]
     assert times == sorted(times, reverse=True)
     assert times
-
-
-# Jumps under `mobile` ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")

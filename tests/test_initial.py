@@ -66,9 +66,6 @@ def apart(circuit: fs.Circuit, law: str | None = None, text: str | None = None, 
     return worst
 
 
-# Random networks ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(cases(140, 40)))
 def test_random_networks_start_and_go_on_as_their_charge_says(seed: int) -> None:
     network = random_network(seed)
@@ -100,9 +97,6 @@ def test_random_networks_with_a_finger_start_as_in_ngspice(seed: int) -> None:
         initial.append(f".ic v(area)={round(float(rng.uniform(20.0, 40.0)), 2)!r}")
     text = deck_of(random_network(seed), STEP, STOP, (*finger("n1", "n2", **gap), *initial))
     assert apart(fs.parse_netlist(text), LAWS[seed % 2], max_step=STEP) <= 1.01e-3
-
-
-# IC= of several capacitors ------------------------------------------------------------------------------------
 
 
 @every_law
@@ -162,25 +156,7 @@ def test_ic_of_capacitors_counts_with_uic_only() -> None:
     assert circuit.unused == ("IC= of C1",)
 
 
-# The operating point with .ic held ---------------------------------------------------------------------------
-
-
-HELD = {
-    "nodes that .ic does not name are at rest": (
-        "V1 a 0 10|R1 a b 1k|R2 b 0 1k|C1 b 0 1n|R3 a c 1k|C2 c 0 1n|R4 c d 1k|R5 d 0 2k|C3 d 0 1n|.ic v(c)=3",
-        {"a": 10.0, "b": 5.0, "c": 3.0, "d": 2.0},
-    ),
-    "a voltage source is stronger than .ic, and tied nodes take the mean": (
-        "V1 a 0 10|V2 a b 4|C1 b 0 1n|R3 b 0 1meg|Vf c d 4|Cc c 0 1n|Rd d 0 1k|.ic v(b)=3 v(c)=7 v(d)=5",
-        {"a": 10.0, "b": 6.0, "c": 8.0, "d": 4.0},
-    ),
-    "a node that only capacitors reach starts where .ic says": (
-        "V1 a 0 10|C1 a b 1n|C2 b 0 2n|.ic v(b)=7", {"a": 10.0, "b": 7.0},
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("lines", "expected"), HELD.values(), ids=HELD)
+@pytest.mark.parametrize(("lines", "expected"), [case for _, *case in listed("held")])
 def test_an_operating_point_with_ic(lines: str, expected: dict[str, float]) -> None:
     assert start(deck(*lines.split("|"), ".tran 1n 10n")) == pytest.approx(expected, rel=1e-13)
 
@@ -215,9 +191,6 @@ def test_the_difference_of_two_nodes_is_node_p_minus_node_n() -> None:
     whole = coat + gap + skin
     assert v["skin"] == pytest.approx(10.0 - 50.0 * skin / whole, rel=1e-10)
     assert v["top"] == pytest.approx(30.0 - 50.0 * (skin + gap) / whole, rel=1e-10)
-
-
-# Areas with dynamics of their own ----------------------------------------------------------------------------
 
 
 @every_law
@@ -262,9 +235,6 @@ def test_start_values_without_effect_are_listed() -> None:
     assert deck(*lines, ".tran 1n 10n").unused == ()
     assert table1(extra=".ic v(area)=34").unused == (".ic v(area)",)
     assert table1(extra=".ic v(area)=34", tran="10u 10m").unused == ()
-
-
-# Exports ------------------------------------------------------------------------------------------------------
 
 
 # The laws in turn: each deck is run under both.

@@ -13,7 +13,7 @@ from scipy.fft import dct
 
 import analytic as ref
 import fingerspice as fs
-from scenes import deck, every_law, table1
+from scenes import DECKS, deck, every_law, table1
 
 EPS0 = 8.854e-12
 SOURCES = {
@@ -131,13 +131,7 @@ def test_a_dc_step_takes_the_integral_of_the_area_within_its_stated_error(volts)
     assert solution.q_source[0] == pytest.approx(charge, rel=1e-13)
 
 
-NO_LEAK = """stack without leaks
-Vdrive drive 0 {source}
-Xcoat drive top area LAYER d=1u eps_r=3.9
-Xgap top skin area GAP d=3.5u eps_r=1 fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
-Xskin skin 0 area LAYER d=350u eps_r=1500
-.tran 0.1m 1m uic
-"""
+NO_LEAK = (DECKS / "without_leaks.cir").read_text()
 
 
 @pytest.mark.parametrize("volts", VOLTS)

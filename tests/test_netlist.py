@@ -11,7 +11,7 @@ import analytic as ref
 import fingerspice as fs
 from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import AcSweep, Tran
-from scenes import listed
+from scenes import DECKS, listed
 
 
 def read(*changes: tuple[str, str]) -> fs.Circuit:
@@ -33,9 +33,6 @@ def warned(text: str) -> list[str]:
     said = [str(w.message) for w in caught]
     assert said == list(circuit.warnings)
     return said
-
-
-# What is right
 
 
 def test_the_papers_deck_is_its_devices_and_its_parameters() -> None:
@@ -75,19 +72,7 @@ def test_names_are_read_in_any_case_and_shown_as_written() -> None:
 
 
 def test_subcircuits_with_parameters_give_the_circuit_of_the_flat_deck() -> None:
-    stack = """\
-Fingerpad
-.include fingerspice.lib
-.param f0=100 u0={2*100}
-.subckt finger in out area d_gap=9u f={f0}
-Xgap in inner area GAP d={d_gap} eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
-Xskin inner out area SKIN d=350u f={f}
-.ends
-Vdrive drive 0 SIN(0 {u0} {f0})
-Xcoat drive top area LAYER d=1u eps_r=3.9 r={0.2*1meg}
-Xf top 0 area finger d_gap={7u/2}
-.tran 10u 50m uic
-"""
+    stack = (DECKS / "fingerpad_in_parts.cir").read_text()
     nested, flat = fs.parse_netlist(stack), read()
     assert [e.name for e in nested.elements] == ["Vdrive", "Xcoat", "Xf.Xgap", "Xf.Xskin"]
     for a, b in zip(nested.elements, flat.elements, strict=True):
@@ -158,9 +143,6 @@ def test_a_deck_without_gap_has_voltages_and_no_forces() -> None:
     expected = ref.sine_frozen_from_rest(100.0, 10.0, 35e-6, solution.t, layers)
     np.testing.assert_allclose(solution.u_layer, expected, rtol=0, atol=1e-11)
     assert set(solution.node_voltages) == {"a", "b"}
-
-
-# What is legal and probably not meant
 
 
 @pytest.mark.parametrize("written", ["0.2MOhm", "0.2M", "0.2Mohm"])

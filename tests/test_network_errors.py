@@ -51,18 +51,8 @@ def test_the_networks_are_of_every_kind() -> None:
         assert len({network.kind[part] for network in drawn}) >= least, part
 
 
-# Nodes ----------------------------------------------------------------------------------------------------------------
-
-
 # The gap stands on ground, so that the node above it has its voltage.
-GAP_BELOW = """gap below
-Vdrive drive 0 SIN(0 {volts} 200)
-{above}
-Xcoat {top} t0 area0 LAYER d=1u eps_r=3.9 r=5meg
-Xgap t0 0 area0 GAP d=3u r=1meg
-.tran 50u 10m uic
-.end
-"""
+GAP_BELOW = (DECKS / "gap_below.cir").read_text()
 NETWORK = GAP_BELOW.format(volts=120, above="Rout drive low 20k\nCcable low 0 100p", top="low")
 STACK = GAP_BELOW.format(volts=120, above="", top="drive")
 
@@ -87,9 +77,6 @@ def test_closed_forms_state_rounding(deck: str, area: str) -> None:
 
 def test_nodes_of_a_run_from_the_periodic_state_have_none() -> None:
     assert fs.simulate(fs.parse_netlist(STACK), start="periodic").error.v_nodes is None
-
-
-# Two fingers, one at a small share of the other's voltage -------------------------------------------------------------
 
 
 RTOL = 1e-8

@@ -17,9 +17,6 @@ WAVES = (fs.Sine(200.0, 5000.0), fs.Square(200.0, 5000.0), fs.Square(150.0, 5000
 SHIPPED = ("amplifier", "ungrounded_user", "two_fingers")
 
 
-# The state --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("source", "law"), by_turns(WAVES))
 @pytest.mark.parametrize("name", SHIPPED)
 def test_it_is_where_a_long_run_ends_within_the_error_stated(name: str, source: fs.Waveform, law: str) -> None:
@@ -102,9 +99,6 @@ def test_a_source_that_settles_late_starts_its_period_there() -> None:
         fs.simulate(circuit, start="periodic", t_eval=[0.0, 1e-4])
 
 
-# Areas that stand still -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", [*SHIPPED, "current_drive"])
 def test_with_its_areas_frozen_it_is_the_phasor_with_the_multipliers_of_its_rates(name: str) -> None:
     circuit = shipped(name)
@@ -129,9 +123,6 @@ def test_a_charge_that_nothing_drains_stays_as_it_was() -> None:
     assert state.stability_margin == pytest.approx(0.0, abs=1e-9)
     one = fs.steady_state(deck(*lines[:-2], "C1 body 0 120p"), rtol=1e-10)
     assert np.abs(one.solution.u_gap - state.solution.u_gap).max() <= 2e-10 * 200.0
-
-
-# Hard ones --------------------------------------------------------------------------------------------------
 
 
 @every_law
@@ -172,9 +163,6 @@ def test_a_charge_that_the_areas_ripple_pumps_for_ever_has_no_periodic_state() -
     assert coat[3] - coat[2] == pytest.approx(coat[1] - coat[0], rel=1e-3)
 
 
-# What has none ----------------------------------------------------------------------------------------------
-
-
 def test_a_current_that_charges_what_nothing_drains_has_no_periodic_state() -> None:
     circuit = deck("I1 0 a SIN(1u 1u 1k)", "C1 a 0 1n", "R1 a b 1k", "C2 b 0 1n")
     with pytest.raises(fs.SolveError, match="charges, from period to period, what nothing drains"):
@@ -183,9 +171,6 @@ def test_a_current_that_charges_what_nothing_drains_has_no_periodic_state() -> N
     swinging = fs.steady_state(circuit.replace({"I1": fs.Sine(1e-6, 1e3)}))
     run = fs.simulate(circuit.replace({"I1": fs.Sine(1e-6, 1e3)}), t_stop=0.02, t_eval=0.019 + swinging.solution.t[:-1])
     assert np.abs(run.node_voltages["a"] - swinging.solution.node_voltages["a"][:-1]).max() <= 1e-9
-
-
-# What stands on it ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [*SHIPPED, "current_drive"])
@@ -244,9 +229,6 @@ def test_the_plan_says_how_far_the_areas_change_and_that_it_is_stepped() -> None
     unknown = fs.plan(shipped("current_drive"))
     assert math.isnan(unknown.sensitivity)
     assert "a current source sets no bound" in unknown.reasons[0]
-
-
-# Sources at fault -------------------------------------------------------------------------------------------
 
 
 def between_two_sources() -> fs.Circuit:
@@ -311,9 +293,6 @@ def test_a_rough_function_counts_in_both_errors_and_in_what_is_asked(name: str, 
     # What moves the voltage by a part moves the force of every finger by twice that.
     peak, force = np.abs(tight.u_gap).max(axis=0), tight.f_el.max(axis=0)
     assert tight.error.f_el >= np.max(2.0 * off / peak * force)
-
-
-# The command line, and folds --------------------------------------------------------------------------------
 
 
 def test_the_command_sweeps_one_of_several_fingers(monkeypatch: Any, capsys: Any, tmp_path: Path) -> None:

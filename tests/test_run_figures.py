@@ -38,9 +38,6 @@ def periodic(law: str) -> tuple[np.ndarray, ref.Transient]:
     return t, ref.periodic_state(ref.sine_segments(U, F, 1.0 / F), freq=F, law=law, t_out=t)
 
 
-# Against closed forms and the reference
-
-
 def test_figures_of_a_sine_with_offset_and_phase_are_the_closed_form() -> None:
     # Of two periods of the periodic state, the area fixed.
     source = fs.Sine(U, F, offset=OFFSET, phase_deg=PHASE)
@@ -198,9 +195,6 @@ def test_a_gap_alone_has_them_too() -> None:
     assert run.u_gap_amplitude == pytest.approx(100.0, rel=1e-9)
 
 
-# Whatever outputs, and however the steps are kept
-
-
 @pytest.mark.filterwarnings("ignore:sources names")
 @pytest.mark.parametrize(("law", "source", "name"), listed("figures"))
 def test_figures_are_the_same_whatever_tstep(law: str, source: str, name: str) -> None:
@@ -294,9 +288,6 @@ def test_weights_of_outputs_integrate_cubics_between_jumps_and_lines_where_point
     # Of 400,000 outputs with a jump at every tenth a loop over the pieces in Python took 18 s.
     t = np.repeat(np.linspace(0.0, 1.0, 360_001), np.where(np.arange(360_001) % 9 == 8, 2, 1))
     assert steps.weigh_outputs(t, np.sin(7.0 * t)).mean() == pytest.approx((1.0 - np.cos(7.0)) / 7.0, rel=1e-12)
-
-
-# As attributes, each an integral of its own, computed once
 
 
 @pytest.mark.parametrize("area", ["coupled", "frozen"])

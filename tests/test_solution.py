@@ -41,9 +41,6 @@ def rows(path: Path) -> tuple[list[str], np.ndarray]:
     return head, np.array(body, float)
 
 
-# Times and arrays
-
-
 def test_times_are_the_output_grid_with_two_rows_at_each_jump_after_the_start(square: fs.Solution) -> None:
     jumps = np.array([0.005, 0.01, 0.015, 0.02, 0.025, 0.03])
     grid = STEP * np.arange(301)
@@ -130,9 +127,6 @@ def test_a_jump_of_one_source_is_not_hidden_by_that_of_another() -> None:
     assert np.count_nonzero(np.diff(fs.simulate(circuit).t) == 0.0) == 1
 
 
-# Arrays and copies
-
-
 def test_arrays_are_read_only_and_the_result_is_frozen(square: fs.Solution) -> None:
     arrays = [*(value for value, _, _ in square.signals.values()), fs.Samples([1.0, 2.0], 1.0).values]
     for array in (square.t, square.u_layer, *arrays, *square.node_voltages.values()):
@@ -184,9 +178,6 @@ def test_every_signal_has_its_unit_and_is_that_of_its_name(square: fs.Solution) 
     np.testing.assert_array_equal(square.friction, square.f_t / 0.5)
 
 
-# Figures
-
-
 def test_figures_of_the_source_of_a_square_are_by_hand(square: fs.Solution) -> None:
     s = square.summary()
     assert s["u_source_rms"] == pytest.approx(200.0, rel=1e-12)
@@ -204,9 +195,6 @@ def test_a_circuit_without_gap_has_figures_of_its_layers(tmp_path: Path) -> None
     assert not [key for key in s if key.startswith(("f_el", "u_gap", "friction"))]
     assert load(solution.to_netcdf(tmp_path / "a.nc")).identical(solution.to_xarray())
     assert "f_el" not in solution.to_xarray()
-
-
-# Files
 
 
 def test_netcdf_holds_what_to_xarray_gives(square: fs.Solution, tmp_path: Path) -> None:

@@ -112,9 +112,6 @@ def test_rates_and_voltages_have_their_digits_though_rates_are_decades_apart_or_
     np.testing.assert_allclose(solution.u_layer * signs, np.array(voltages)[:, back], rtol=0, atol=200.0 * 1e-12)
 
 
-# Sources ----------------------------------------------------------------------------------------------------
-
-
 def test_sources_in_series_add_with_their_directions_and_their_nodes_have_their_potentials() -> None:
     layers = ("Xcoat n1 n2 area LAYER d=1u eps_r=3.9 r=0.2meg", "Xair n3 0 area LAYER d=3.5u eps_r=1 r=1meg")
     circuit = deck("Va n0 0 7", "Vb n1 n0 3", *layers, "Vc n2 n3 SIN(0 2 1k)", "Varea area 0 35", ".tran 20u 1m uic")
@@ -230,9 +227,6 @@ def test_what_is_not_a_stack_is_a_network(case: str) -> None:
     assert largest > 1e-3
     for node, v in exact.node_voltages.items():
         assert np.abs(solution.node_voltages[node] - v).max() <= 3e-6 * largest
-
-
-# Circuits as data -------------------------------------------------------------------------------------------
 
 
 def test_every_parameter_is_listed_by_path_with_value_and_unit() -> None:

@@ -27,7 +27,7 @@ from commands import tree
 from fingerspice.studies.sweep import chunks, populations
 from fingerspice.studies.sweep.populations import Draws, Plan
 from processes import forked, no_room_here
-from scenes import CIRCUITS, cases, listed, shipped
+from scenes import CIRCUITS, DECKS, cases, listed, shipped
 
 # How often a whole program, and a worker, is killed; each takes seconds to start.
 KILLS, KILLS_OF_WORKERS = cases(20, 2), cases(20, 1)
@@ -443,23 +443,20 @@ def test_bad_requests_are_refused_before_anything_is_written(circuit, parameters
     assert not list(tmp_path.iterdir())
 
 
-FILE = """deck = "fingerpad.cir"
-n = 64
-seed = 1
-outputs = ["f_el_mean_periodic"]
-periodic = true
-[parameters]
-"source.frequency" = { log = [20, 2000, 6] }
-"Xgap.d" = { lognormal = [3.5e-6, 0.1] }
-"""
+FILE, SMALL = ((DECKS / name).read_text() for name in ("fingers.toml", "fingers_with_indices.toml"))
+
+
+def described(folder: Path, text: str) -> Path:
+    """The file of a sweep beside its deck."""
+    for name in ("fingerpad.cir", "fingerspice.lib"):
+        (folder / name).write_bytes((CIRCUITS / name).read_bytes())
+    (folder / "fingers.toml").write_text(text)
+    return folder / "fingers.toml"
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    for name in ("fingerpad.cir", "fingerspice.lib"):
-        (tmp_path / name).write_bytes((CIRCUITS / name).read_bytes())
-    (tmp_path / "fingers.toml").write_text(FILE)
-    return tmp_path / "fingers.toml"
+    return described(tmp_path, FILE)
 
 
 @pytest.mark.usefixtures("_forked_workers")
@@ -646,27 +643,8 @@ def test_bad_sweeps_are_refused_in_one_sentence(circuit, parameters, how, said):
             fs.sobol(circuit, parameters, **how)
 
 
-SMALL = """deck = "fingerpad.cir"
-n = 32
-outputs = ["f_el_mean_periodic"]
-periodic = true
-indices = true
-[parameters]
-"Xgap.d" = { lognormal = [3.5e-6, 0.1] }
-"Xskin.d" = { uniform = [3e-4, 4e-4] }
-"""
-
-
-def described(folder: Path, text: str) -> str:
-    """The file of a sweep beside its deck."""
-    for name in ("fingerpad.cir", "fingerspice.lib"):
-        (folder / name).write_bytes((CIRCUITS / name).read_bytes())
-    (folder / "fingers.toml").write_text(text)
-    return str(folder / "fingers.toml")
-
-
 def test_the_command_writes_scenes_indices_and_a_picture(tmp_path, command):
-    file = described(tmp_path, SMALL)
+    file = str(described(tmp_path, SMALL))
     done = command("sweep", file, "--out", str(tmp_path / "o"), "--json")
     answer = json.loads(done.out)
     assert done.code == 0, done.err
@@ -683,7 +661,7 @@ def test_the_command_writes_scenes_indices_and_a_picture(tmp_path, command):
 
 @pytest.mark.parametrize(("change", "said"), listed("sweep_files"))
 def test_bad_files_are_refused_in_one_sentence(tmp_path, command, change, said):
-    done = command("sweep", described(tmp_path, SMALL.replace(*change)), "--out", str(tmp_path / "o"))
+    done = command("sweep", str(described(tmp_path, SMALL.replace(*change))), "--out", str(tmp_path / "o"))
     assert done.code == 2
     assert said in done.err
     assert "Traceback" not in done.err
