@@ -1,22 +1,16 @@
 """Independent high-precision reference for the electroadhesive fingertip model.
 
-Nothing here comes from the package under test: every formula is written from the paper (Forsbach & Heß,
-equation numbers in brackets) in its repaired reading. SI units at every function boundary; the paper's mm
-and N occur only in `PAPER_TABLE1`, where they are converted once, and inside `ridge_area_unloaded_mp`, which
-solves Eq. 4 as printed.
+Nothing here comes from the package: every formula is written from the paper (Forsbach & Heß, equation numbers in
+brackets) in its repaired reading. SI units at every function boundary; the paper's mm and N occur only in
+`PAPER_TABLE1`, where they are converted once, and inside `ridge_area_unloaded_mp`, which solves Eq. 4 as printed.
 
-How a transient is computed
----------------------------
-State: the leaked charges w_x (per area under `local`, total under `mobile`), so no derivative of U is
-needed. Each smooth piece is solved by Radau IIA collocation (12 stages, order 23; or Gauss, order 24) with
-full Newton and a step controlled by the decay of the Legendre coefficients of the solution (last two below
-1e-14 of the peak voltage). Pieces end at the declared segment edges and on every zero of u_a, located to
-rounding, where A(|u_a|) has its kink; inside a piece the area is continued analytically through u_a = 0.
-Outputs are values of the collocation polynomial, spectrally accurate at any time. Gauge: adding one function
-of time to all w_x changes no voltage; here the w of the gap stands still, and each step starts from the
-layer voltages (D = 0, or Q = 0), so nothing drifts.
-
-Achieved accuracy: measured figures are in the docstring of `transient`.
+A transient's state are the leaked charges w_x (per area under `local`, total under `mobile`), so no derivative of U is
+needed. Each smooth piece is solved by Radau IIA collocation (12 stages, order 23; or Gauss, order 24) with full Newton
+and a step controlled by the decay of the Legendre coefficients (last two below 1e-14 of the peak voltage). Pieces end
+at the edges of segments and on every zero of u_a, located to rounding, where A(|u_a|) has its kink; inside a piece the
+area is continued analytically through u_a = 0. Outputs are values of the collocation polynomial. Gauge: one function
+of time in all w_x changes no voltage; here the w of the gap stands still, and each step starts from the layer
+voltages.
 """
 
 from __future__ import annotations
@@ -625,25 +619,14 @@ class FoldError(ValueError):
 def fold_margin(
     p: float, kk: float, params: Parameters = TABLE1, k: float = 1.0, branch: float | None = None
 ) -> tuple[float, float]:
-    """How far the mobile equation u = p + kk A(0)/A(|u|) is from the fold of the branch it is on.
+    """How far, V, the mobile equation u = p + kk A(0)/A(|u|) is from the fold of its branch, and u there, V.
 
-    With s the sign of u and v = |u| the residual is r(v) = v - s p - s kk A(0)/A(v). Two kinds of fold:
-    s kk > 0, less area, more volts, less area: the stable root is the first one, it ends at the first
-    maximum of r. s kk < 0 and kk so large that r falls at v = 0 (area grows with voltage there; only at tiny
-    loads): the stable root is the last one, it ends at the minimum of r, before u reaches zero.
-
-    Parameters
-    ----------
-    p : U / (S c_a), V: the capacitive share of the source.
-    kk : leaked part (sum l_x/c_x / S - l_a) / (c_a A(0 V)), V.
-    params, k : the contact.
-    branch : sign of u on the branch; default the sign of p + kk.
-
-    Returns
-    -------
-    margin : V: the value of r at that maximum (minus r at that minimum): the source share may move by this
-        much; negative when there is no solution, ``inf`` when the branch has no fold.
-    u : V: the signed gap voltage at the fold.
+    `p` is U/(S c_a), the capacitive share of the source, and `kk` the leaked part, (sum l_x/c_x / S - l_a)/(c_a A(0)),
+    both in V; `branch` is the sign of u, by default that of p + kk. With s that sign and v = |u| the residual is
+    r(v) = v - s p - s kk A(0)/A(v). Where s kk > 0 the stable root is the first one and ends at the first maximum of
+    r; where s kk < 0 and r falls at v = 0, which only tiny loads give, it is the last one and ends at the minimum of
+    r. The margin is r at that maximum, or minus r at that minimum: so far the source's share may move. It is negative
+    where there is no solution, and ``inf`` where the branch has no fold.
     """
     s = math.copysign(1.0, p + kk if branch is None else branch)
     a_zero = float(contact(0.0, params, k)[1])
@@ -1381,15 +1364,10 @@ def transient(
     peak source (or start) voltage. Values at a jump are right-hand values; at the last time, left-hand ones. Under
     `mobile` a fold ends the run: `fold` says where, later outputs are NaN.
 
-    Charge: i = A D' = c_a A u_a' + u_a / R_a, so q = c_a (G(u_a) - G(u_a before)) + int u_a / R_a dt with G
-    the primitive of A(|u|), exact also across jumps (`local`); c_a A u_a replaces c_a G under `mobile`.
-
-    Accuracy, all relative to the peak (Table 1 at 200 V and 2 kV, 100 Hz and 5 kHz, sine, square and ramps
-    with jumps, both laws): Radau 12 against Gauss 16 and Radau 9 agree to 1.2e-15 in u, 3e-15 in q, 1.4e-15
-    in F_el; against DOP853 at rtol 1e-13, in voltage form, to 1.6e-13 (its own error); frozen area against the mpmath
-    exponentials, 5e-15 (R_i = 1 ohm included). 500 periods at 5 kHz: 4e-15 in u. Zeros of u_a are
-    hit to 1.2e-15 of the peak. Fold times: 1e-11 of the period where u_a runs into the fold (10 nm gap), 1e-7
-    of the period at F_N = 1e-4 N (slaved gap).
+    Charge: q = c_a (G(u_a) - G(u_a before)) + int u_a / R_a dt with G the primitive of A(|u|), exact also across jumps
+    (`local`); c_a A u_a replaces c_a G under `mobile`. Accuracy, relative to the peak: Radau 12, Gauss 16 and Radau 9
+    agree to 3e-15, and with DOP853 at 1e-13 to 1.6e-13, its own error. Fold times: 1e-11 of the period where u_a runs
+    into the fold (10 nm gap), 1e-7 at F_N = 1e-4 N (slaved gap).
     """
     if layers is None:
         if freq is None:
@@ -1592,16 +1570,11 @@ def dop853_leak(
     law: str = "local",
     rtol: float = 1e-13,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Leaked-charge form of either law by DOP853, from the uncharged state, in an absolute gauge.
+    """Leaked charge of either law by DOP853 from rest, in an absolute gauge; arguments as in `dop853_voltage`.
 
-    `local`: lambda_x' = u_x/(R_x A), D = (U + sum lambda/c)/S. `mobile`: l_x' = u_x/R_x, Q = (A U + sum
-    l/c)/S with the gap voltage from the bracketed scalar equation at every evaluation. Arguments as in
-    `dop853_voltage`.
-
-    Returns
-    -------
-    u : (len(t_out), 3) layer voltages, V.
-    d : (len(t_out),) D in C/m^2 (`local`) or Q in C (`mobile`; here the charge through the terminals).
+    `local`: lambda_x' = u_x/(R_x A), D = (U + sum lambda/c)/S. `mobile`: l_x' = u_x/R_x, Q = (A U + sum l/c)/S with
+    the gap voltage from the bracketed scalar equation. Returns the layer voltages, (len(t_out), 3) in V, and D in
+    C/m^2 (`local`) or Q in C (`mobile`; here the charge through the terminals).
     """
     layers = table1_layers(freq, params)
     c = np.array([x.c for x in layers])

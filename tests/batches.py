@@ -1,7 +1,5 @@
 """Scenes for `fs.batch`, and what single runs and stated errors make of their figures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 
@@ -57,3 +55,15 @@ def check(
     assert off.max() <= rtol
     assert np.mean(off <= found.error.values + slack) >= 0.95
     return found
+
+
+def alike(circuit: fs.Circuit, parameters: dict[str, Any], **how: Any) -> Any:
+    """A batch, of which neither threads nor the order of the scenes change a byte."""
+    first = fs.batch(circuit, parameters, threads=1, **how)
+    straight = np.arange(first.sizes["scene"])
+    for threads, order in ((3, straight), (2, np.random.default_rng(0).permutation(straight))):
+        some = {path: values[order] for path, values in parameters.items()}
+        other = fs.batch(circuit, some, threads=threads, **how)
+        for name in (name for name in first.data_vars if "scene" in first[name].dims):
+            assert other[name].values[np.argsort(order)].tobytes() == first[name].values.tobytes(), name
+    return first

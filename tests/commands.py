@@ -1,7 +1,5 @@
 """Runs `fingerspice ARGUMENTS` in this process, for the tests of the command line."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass

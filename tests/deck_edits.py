@@ -1,7 +1,5 @@
 """Table 1's deck with one line changed, for tests that refer to its lines, and the value of one expression."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from fingerspice.base.errors import Where

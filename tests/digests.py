@@ -6,8 +6,6 @@ both errors that are stated.
 Run: python tests/digests.py FILE.json writes the digests where there is no such file, and compares with it otherwise.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import warnings

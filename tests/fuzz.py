@@ -3,8 +3,6 @@
 `python tests/fuzz.py --inputs 1000000 --seed 0`; the line of a failure gives the command that repeats it alone.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import os

@@ -1,7 +1,5 @@
 """Inputs for the fuzzer: mutated decks, arithmetic, sources and tables, each from its own random generator."""
 
-from __future__ import annotations
-
 import random
 import re
 from collections.abc import Callable, Sequence

@@ -9,8 +9,6 @@ and the fold is D = 0. In the variable s with dt = D ds the same equations are s
 du_a/ds = N.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

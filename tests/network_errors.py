@@ -7,8 +7,6 @@ each of `RTOLS` and once at `TIGHT`, which gives the true errors of gap voltage,
 Run: python tests/network_errors.py [--networks 100] [--first 0]. A network is determined by its number alone.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import warnings

@@ -3,8 +3,6 @@
 It never imports the package.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

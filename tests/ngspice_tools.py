@@ -3,8 +3,6 @@
 Used by the tests that compare with ngspice; independent of the model.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Runs the command in a process of its own, also with limits such as a full disk or too little memory."""
 
-from __future__ import annotations
-
 import atexit
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Random decks with every device, source and directive, and both charge laws, for the export to ngspice."""
 
-from __future__ import annotations
-
 import random
 import warnings
 

@@ -9,8 +9,6 @@ Run: python tests/recording_errors.py [--recordings 100] [--first 0] [--networks
 A recording is determined by its number alone.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import warnings

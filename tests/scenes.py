@@ -1,9 +1,8 @@
 """Circuits for the tests: Table 1's deck with the changes that a test needs."""
 
-from __future__ import annotations
-
 import os
 import re
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +14,8 @@ from scipy.stats import binom
 import fingerspice as fs
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
+DECKS = Path(__file__).with_name("decks")
+CASES = tomllib.loads(Path(__file__).with_name("cases.toml").read_text("utf-8"))
 LAWS = ("local", "mobile")
 every_law = pytest.mark.parametrize("law", LAWS)
 T = TypeVar("T")
@@ -28,6 +29,12 @@ GAP = {
 def cases(whole: T, few: T) -> T:
     """How many random cases a statistic takes, or which: `whole` in ``make stress``, which sets STRESS, else `few`."""
     return whole if os.environ.get("STRESS") else few
+
+
+def listed(kind: str) -> list[Any]:
+    """A table of `cases.toml`, such as of what is wrong and what is said."""
+    rows: list[Any] = CASES[kind]
+    return rows
 
 
 def by_turns(values: Iterable[T]) -> list[tuple[T, str]]:

@@ -1,7 +1,5 @@
 """The tables of docs/sets.md, made of the sets' files; ``python tests/sets_page.py`` writes them into the page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import fingerspice as fs

@@ -4,8 +4,6 @@ It never imports the package. The start minimises a list of quadratic forms one 
 that the minima of the earlier forms leave free.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -6,8 +6,6 @@ errors, and the exceptions are counted. A scene is determined by seed and number
 Run: python tests/stress.py [--scenes 10000] [--seed 0] [--first 0] [--workers N] [--json PATH].
 """
 
-from __future__ import annotations
-
 import argparse
 import collections
 import dataclasses

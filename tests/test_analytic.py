@@ -3,8 +3,6 @@
 Nothing of the package is imported: these tests check the reference that checks the package.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Allowed imports between modules, and limits of every source file, checked on the source text without running it."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import subprocess

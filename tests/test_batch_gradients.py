@@ -1,7 +1,5 @@
 """`fs.batch(gradients=...)`, against fourth-order differences of single runs at 1e-12, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from batches import population
+from batches import alike, population
 from fingerspice.circuit.circuit import Circuit
 from scenes import cases, shipped, table1
 
@@ -47,13 +45,6 @@ def expected(scene: Circuit, path: str, how: dict[str, Any]) -> dict[str, float]
     return total
 
 
-def uneven() -> Circuit:
-    """A source of points at uneven times."""
-    t = np.linspace(0.0, 0.05, 701)
-    times = np.sort(np.append(t, t[:-1] + 0.3 * np.diff(t)))
-    return table1().replace({"Vdrive": fs.PWL(times, 150.0 * np.sin(2.0 * np.pi * 150.0 * times))})
-
-
 TWO, CLOCK = {"Xgap.d": [3e-6, 4e-6]}, ("Vdrive.frequency", "Xgap.d")
 OWN, FOLLOWED = ("Xgap.d", "Xcoat.r"), {"Vdrive.frequency": [80.0, 400.0]}
 BY_TURNS, FOLLOW, PERIODIC = {"periods": 3}, {"periods": 3, "skin": "follow"}, {"periodic": True}
@@ -74,7 +65,6 @@ CASES: dict[str, tuple[Any, ...]] = {
     "frequency, of the deck": (1, table1(), THREE, CLOCK, (1e-5,), {}),
     "followed": (0, table1(), FOLLOWED, CLOCK, (1e-5,), FOLLOW),
     "followed, alone": (1, table1(), FOLLOWED, CLOCK, (1e-9,), FOLLOW),
-    "uneven points": (1, uneven(), {"Xgap.d": [3e-6]}, ("Xgap.d", "Xgap.r"), (1e-5,), {}),
 }  # fmt: skip
 for kind in ("sine", "square"):
     for law in ({}, MOBILE):
@@ -84,10 +74,7 @@ for kind in ("sine", "square"):
 
 
 @pytest.mark.parametrize(("status", "circuit", "parameters", "paths", "rtols", "how"), CASES.values(), ids=CASES)
-def test_derivatives_have_the_errors_allowed_and_stated(
-    status: int, circuit: Circuit, parameters: dict[str, Any], paths: tuple[str, ...], rtols: tuple[float, ...],
-    how: dict[str, Any],
-) -> None:  # fmt: skip
+def test_derivatives_have_the_errors_allowed_and_stated(status, circuit, parameters, paths, rtols, how):
     how = {"outputs": MEANS, **how}
     n = len(next(iter(parameters.values())))
     scenes = [circuit.varied({path: values[i] for path, values in parameters.items()}) for i in range(n)]
@@ -127,17 +114,8 @@ def test_means_are_the_same_bytes_with_gradients_and_all_the_same_for_any_thread
     rng, n = np.random.default_rng(5), 700
     parameters = {"Xgap.d": rng.uniform(3e-6, 4e-6, n), "Xgap.r": 1e6 * 10.0 ** rng.uniform(-1.0, 1.0, n)}
     plain = fs.batch(table1(), parameters, periods=2, rtol=1e-5)
-
-    def run(threads: int, order: np.ndarray) -> list[bytes]:
-        some = {path: values[order] for path, values in parameters.items()}
-        found = fs.batch(table1(), some, periods=2, rtol=1e-5, gradients=("Xgap.d", "Xgap.fn"), threads=threads)
-        back = np.argsort(order)
-        assert found.f_el_mean.values[back].tobytes() == plain.f_el_mean.values.tobytes()
-        return [found[name].values[back].tobytes() for name in ("d_f_el_mean", "gradient_error", "gradient_status")]
-
-    first = run(1, np.arange(n))
-    assert run(2, np.arange(n)) == first
-    assert run(3, rng.permutation(n)) == first
+    found = alike(table1(), parameters, periods=2, rtol=1e-5, gradients=("Xgap.d", "Xgap.fn"))
+    assert found.f_el_mean.values.tobytes() == plain.f_el_mean.values.tobytes()
 
 
 def test_a_scene_without_a_result_has_none_and_costs_the_others_nothing() -> None:
@@ -176,23 +154,6 @@ def test_the_dataset_says_what_it_holds(tmp_path: Path) -> None:
     assert found.d_f_el_mean.attrs["units"] == "N per parameter_unit"
     assert "d_f_el_rms" not in found
     found.to_netcdf(tmp_path / "batch.nc", engine="h5netcdf")
-
-
-@pytest.mark.parametrize(
-    ("gradients", "options", "message"),
-    [
-        (("Xgap.dd",), {}, "unknown parameter 'Xgap.dd'; nearest: 'Xgap.d'"),
-        ("Xgap.d", {}, "a sequence of paths"),
-        (("Xgap.d", "xgap.d"), {}, "every parameter once"),
-        (("Xgap.tau",), {}, "Xgap.tau, which is 0"),
-        (("Vdrive.phase_deg",), {}, "Vdrive.phase_deg, which is 0"),
-        (("Xgap.d",), {"outputs": ("f_el_rms",)}, "outputs has no mean"),
-        (("Xskin.f",), {"skin": "follow"}, "with which the skin's frequency changes"),
-    ],
-)
-def test_bad_input_is_refused_in_one_sentence(gradients: Any, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(fs.InputError, match=message):
-        fs.batch(table1(), {"Xgap.r": [1e6]}, gradients=gradients, periods=1, **options)
 
 
 def test_two_fingers_are_refused() -> None:

@@ -1,7 +1,5 @@
 """Sources that cancel, carriers that coarse samples miss, common periods, and runs whose work does not jump."""
 
-from __future__ import annotations
-
 import math
 import warnings
 
@@ -11,19 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
-from scenes import cases, every_law, table1
+from scenes import DECKS, cases, every_law, table1
 
-THREE_PHASES = """Three sources of 50 V, 120 degrees apart
-.include fingerspice.lib
-V1 n1 0 SIN(0 50 100)
-V2 n2 n1 SIN(0 50 100 0 0 120)
-V3 drive n2 SIN(0 50 100 0 0 240)
-{beside}Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg
-Xgap top skin area GAP d=3.5u r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
-Xskin skin 0 area SKIN d=350u f=100
-.tran 10u 50m uic
-.end
-"""
+THREE_PHASES = (DECKS / "three_phases.cir").read_text()
 # A double of 50 V is rounded by 7e-15 V: no voltage of a balanced drive is more than some hundred of these.
 ZERO = 1e-12
 

@@ -1,6 +1,4 @@
-"""The command line: files, printed text and exit codes; bad input gets one sentence and leaves no file behind."""
-
-from __future__ import annotations
+"""The command line: files, printed text, exit codes, and the keys of `--json` however a command ends."""
 
 import contextlib
 import csv
@@ -10,7 +8,9 @@ import json
 import math
 import os
 import re
+import shlex
 import shutil
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -23,7 +23,9 @@ import xarray
 import fingerspice as fs
 from commands import QUICK, Command, Result, tree
 from deck_edits import edited
+from fingerspice.cli.terminal import COMMON, FIGURES, OWN
 from fingerspice.results.runfile import create
+from scenes import CIRCUITS, listed, shipped
 
 OUT = {"out", "out/.gitignore"}
 """What stands where nobody named a folder, besides the results."""
@@ -74,34 +76,19 @@ def test_json_is_all_that_is_printed_and_null_stands_for_no_number(command: Comm
     assert sweep["gain"][0] > 0.0
 
 
-def test_two_decks_that_differ_after_a_dot_do_not_share_their_files_which_git_ignores(command: Command) -> None:
-    ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
-    assert "/out/" in ignored
-    for name in ("pad.v1", "pad.v2"):
-        Path(f"{name}.cir").write_text(edited(QUICK))
-        assert command("run", f"{name}.cir", "--no-plot").out.splitlines()[-1] == f"wrote out/{name}.nc"
-    assert {"out/pad.v1.nc", "out/pad.v2.nc"} <= set(tree(Path()))
-
-
-def test_set_changes_values_all_at_once_with_units_and_in_any_case(command: Command) -> None:
+def test_options_are_those_of_the_interface_and_values_change_all_at_once_in_any_case(command: Command) -> None:
     # Either exponent alone would be out of range on its way.
     changes = ["--set", "Xgap.m_exp=1.5", "--set", "xgap.N_EXP = 1.9", "--set", "Xcoat.r=inf"]
-    report = figures(command("run", "pad.cir", "--json", "--no-plot", *changes))
-    circuit = fs.read_netlist("pad.cir").replace({"Xgap.m_exp": 1.5, "Xgap.n_exp": 1.9, "Xcoat.r": float("inf")})
-    assert row(report, "f_el")["mean"] == fs.simulate(circuit).summary()["f_el_mean"]
-    with xarray.open_dataset("out/pad.nc") as data:
-        assert json.loads(data.attrs["overrides"])["Xgap.m_exp"] == "1.5"
-
-
-def test_source_area_method_law_and_rtol_are_those_of_the_interface(command: Command) -> None:
     words = ["--source", "PULSE(-150 150 0 0 0 2m 10m)", "--area", "30u", "--method", "radau"]
-    report = figures(
-        command("run", "pad.cir", "--json", "--no-plot", *words, "--charge-law", "mobile", "--rtol", "1e-6")
-    )
-    circuit = fs.read_netlist("pad.cir").replace({"Vdrive": fs.Pulse(-150, 150, 0, 0, 0, 2e-3, 0.01)})
+    words += ["--charge-law", "mobile", "--rtol", "1e-6", "--json", "--no-plot"]
+    report = figures(command("run", "pad.cir", *changes, *words))
+    circuit = fs.read_netlist("pad.cir").replace({"Xgap.m_exp": 1.5, "Xgap.n_exp": 1.9, "Xcoat.r": float("inf")})
+    circuit = circuit.replace({"Vdrive": fs.Pulse(-150, 150, 0, 0, 0, 2e-3, 0.01)})
     solution = fs.simulate(circuit, area=30e-6, method="radau", charge_law="mobile", rtol=1e-6)
     assert row(report, "u_gap")["max"] == solution.summary()["u_gap_max"]
+    assert row(report, "f_el")["mean"] == solution.summary()["f_el_mean"]
     with xarray.open_dataset("out/pad.nc") as data:
+        assert json.loads(data.attrs["overrides"])["Xgap.m_exp"] == "1.5"
         used = {key: data.attrs[key] for key in ("method", "charge_law", "rtol", "area")}
     assert used == {"method": "radau", "charge_law": "mobile", "rtol": "1e-06", "area": "3e-05 m^2"}
 
@@ -136,7 +123,12 @@ def test_a_solve_that_fails_keeps_what_it_has_and_says_when_and_how_close(comman
         assert data.attrs["status"] == "FOLD"
         assert float(data.time[-1]) == pytest.approx(float(said[1]), rel=1e-9)
         assert f"{float(data.u_gap[-1]):.4g}" == said[2]
-    assert f"status: {report['message']}" in command(*words).out
+    keys = ("status", "cause", "action", "t", "step", "element", "u_gap", "area", "fold_margin", "tried")
+    assert set(report["failure"]) == set(keys)
+    assert set(report["failure"]["tried"][0]) == {"t", "step", "error"}
+    plain = command(*words).out
+    assert f"status: {report['message']}" in plain
+    assert "last steps tried:" in plain
 
 
 # Warnings and notes
@@ -158,9 +150,11 @@ def test_a_skin_at_another_frequency_or_too_much_voltage_is_warned_about_once(co
 
 
 def test_what_the_reader_notices_is_printed_once_with_its_line(command: Command) -> None:
-    lines = ".nodeset v(area)=35\n.backanno\n.meas tran x max v(top)\n.end"
+    lines = ".nodeset v(area)=35\n.backanno\n.meas tran x max v(top)\n.options reltol=1e-4 trtol=7\n.end"
     Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", lines)))
-    first, second = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200").lines
+    result = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200")
+    first, second = (line for line in result.lines if "note" not in line)
+    assert "note: .options reltol, trtol: of no effect here, where --rtol alone sets the error" in result.err
     assert first.startswith("fingerspice: warning: pad.cir:5:41: Xgap r: '1MOhm' is milli (0.001 ohm)")
     assert second == "fingerspice: warning: .meas has no effect here"
 
@@ -260,6 +254,10 @@ def test_stop_and_start_are_those_of_the_interface(command: Command) -> None:
     report = figures(command("run", "pad.cir", "--stop", "10m", "--start", "periodic", "--json", "--no-plot"))
     solution = fs.simulate(fs.read_netlist("pad.cir"), t_stop=0.01, start="periodic")
     assert row(report, "f_el")["mean"] == solution.summary()["f_el_mean"]
+    # The run itself begins at 0.
+    late = fs.parse_netlist(edited((".tran 10u 50m uic", ".tran 50u 18m 12m uic")))
+    report = figures(command("run", "pad.cir", "--stop", "18m", "--start", "12m", "--json", "--no-plot", "--csv"))
+    assert row(report, "f_el")["mean"] == pytest.approx(fs.simulate(late).f_el_mean, rel=1e-6)
     # A deck without .tran needs no more than an end.
     Path("endless.cir").write_text(edited((".tran 10u 50m uic", "*")))
     assert figures(command("run", "endless.cir", "--stop", "10m", "--json", "--no-plot"))["t_stop"] == 0.01
@@ -360,3 +358,85 @@ def test_ac_without_a_gap_writes_the_node_voltages(command: Command) -> None:
     assert head.startswith(
         "frequency [Hz],v:in [V],phase_deg:in [deg],v:out [V],phase_deg:out [deg],amplitude [V],impedance"
     )
+
+
+DOCUMENT = (Path(__file__).parents[1] / "docs" / "json.md").read_text()
+FLAT = "t\nV1 a 0 SIN(0 10 100)\nXcoat a 0 area LAYER d=1u eps_r=2 r=1k\nVarea area 0 35\n.tran 100u 20m uic\n"
+RC = "t\nV1 a 0 SIN(0 10 100)\nR1 a b 1k\nC1 b 0 1u\n.tran 100u 20m uic\n"
+
+
+def answer(result: Result, command: str) -> Any:
+    data = json.loads(result.out)
+    assert set(data) == {*COMMON, *OWN[command]}
+    assert data["command"] == command
+    assert data["version"] == fs.__version__
+    assert data["success"] is (result.code == 0)
+    assert (data["status"] == "SUCCESS") is data["success"]
+    assert isinstance(data["message"], str)
+    assert (data["failure"] is not None) is (result.code == 1)
+    for kind in ("warnings", "files"):
+        assert isinstance(data[kind], list)
+    return data
+
+
+@pytest.mark.parametrize(("line", "code"), listed("json"))
+def test_the_keys_are_the_same_however_a_command_ends(command: Command, line: str, code: int) -> None:
+    Path("flat.cir").write_text(FLAT)
+    Path("rc.cir").write_text(RC)
+    Path("two_fingers.cir").write_text((CIRCUITS / "two_fingers.cir").read_text())
+    words = shlex.split(line)
+    result = command(*words, "--json")
+    assert result.code == code
+    if words[0] == "rnu":
+        data = json.loads(result.out)
+        assert (set(data), data["command"]) == (set(COMMON), None)
+        assert data["message"].startswith("No such command 'rnu'")
+    else:
+        data = answer(result, words[0])
+    assert all(Path(file).is_file() for file in data["files"])
+    if code == 2:
+        assert data["status"] == "BAD_INPUT"
+        assert data["files"] == []
+
+
+def test_an_answer_says_what_was_asked_changed_and_warned_of(command: Command) -> None:
+    words = ["--set", "Xskin.f=200", "--source", "SQUARE(100 100)", "--charge-law", "mobile", "--rtol", "1e-6"]
+    data = answer(command("run", "pad.cir", "--no-plot", "--json", *words), "run")
+    assert (data["title"], data["charge_law"], data["method"], data["rtol"]) == (
+        *("Fingerpad", "mobile", "exponential", 1e-6),
+    )
+    assert set(data["overrides"]) == {"Xskin.f", "Vdrive"}
+    (said,) = data["warnings"]
+    assert said.endswith("Xskin.f=100 would match")
+
+
+def test_the_rows_are_the_figures_of_the_summary_by_element(command: Command) -> None:
+    data = answer(command("run", str(CIRCUITS / "two_fingers.cir"), "--json", "--no-plot"), "run")
+    solution = fs.simulate(shipped("two_fingers"))
+    rows = {(row["signal"], row["element"]): row for row in data["signals"]}
+    assert {element for signal, element in rows if signal == "f_el"} == set(solution.gaps)
+    for i, name in enumerate(solution.gaps):
+        assert rows["f_el", name]["mean"] == solution.summary()[f"f_el:{name}_mean"]
+        assert rows["u_gap", name]["max"] >= solution.u_gap[:, i].max()  # type: ignore[index]
+    for row in data["signals"]:
+        assert set(row) == {"signal", "element", "unit", *FIGURES}
+    pad = answer(command("run", "pad.cir", "--json", "--no-plot"), "run")
+    assert [row["element"] for row in pad["signals"] if row["signal"] == "f_el"] == ["Xgap"]
+
+
+def test_every_key_is_documented() -> None:
+    for key in {*COMMON, *(key for keys in OWN.values() for key in keys), *FIGURES}:
+        assert f"`{key}`" in DOCUMENT, key
+
+
+def test_nothing_but_json_is_printed_with_stderr_closed_too(tmp_path: Path) -> None:
+    (tmp_path / "pad.cir").write_text(edited((".end", ".meas tran top max v(top)\n.end")))
+    for words, code in (
+        ("run pad.cir --no-plot --charge-law mobile --set Xgap.d=10n --set Xskin.f=200 --json 0<&- 2>&-", 1),
+        ("plan pad.cir --set Xskin.f=200 --json 2>&-", 0),
+        ("run none.cir --json 2>&-", 2),
+    ):
+        line = f"{shlex.quote(sys.executable)} -m fingerspice {words}"
+        done = subprocess.run(["sh", "-c", line], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        assert (done.returncode, done.stderr) == (code, "")
+        assert json.loads(done.stdout)["success"] is (code == 0)

@@ -1,7 +1,5 @@
 """Compiled code and its cache: full disks, killed processes, changed sources; and tuples passed by their address."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import os
@@ -19,11 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from numba import njit
-from numba.core.errors import TypingError
 
 import fingerspice as fs
 from fingerspice.base.announcing import LONG
-from fingerspice.base.compiled import borrow, jit, jit_by_kind
+from fingerspice.base.compiled import borrow
 from processes import ended, no_room, start
 
 faults = pytest.mark.skipif(sys.platform != "linux", reason="faults are made by Linux's means")
@@ -48,7 +45,6 @@ def strike(*names):
     replace(*names)
 caching.os.replace = strike
 """
-
 
 # No folder can be written, the package's neither, as for one that others installed.
 SHUT = """
@@ -202,9 +198,6 @@ def test_killed_while_it_keeps_compiled_code_it_works_the_next_time(copy: Path) 
     assert area(copy) == (0, [], out)
 
 
-# A change of any source ---------------------------------------------------------------------------------------------
-
-
 def test_compiling_is_announced_by_one_line_and_repeated_only_after_a_change_of_its_sources(copy: Path) -> None:
     def change(*names: str) -> None:
         for name in names:
@@ -328,112 +321,22 @@ def test_what_is_built_on_private_classes_of_numba_does_what_it_is_for(tmp_path:
     assert found == ["0\n", "1\n"]
 
 
-# Tuples passed by their address, and functions chosen by the class of such a tuple -----------------------------------
-
-
-class Inner(NamedTuple):
-    x: np.ndarray
-    n: int
-
-
 class Outer(NamedTuple):
-    inner: Inner
+    x: np.ndarray
     pair: tuple[np.ndarray, np.ndarray]
     y: np.ndarray
-    on: bool
-    scale: float
-
-
-class Alike(NamedTuple):
-    """All of one type: numba knows such tuples as another kind."""
-
-    x: np.ndarray
-    y: np.ndarray
-
-
-def outer() -> Outer:
-    return Outer(Inner(np.arange(3.0), 7), (np.ones(2), np.full(2, 5.0)), np.zeros((2, 3)), True, 0.5)
 
 
 @njit
-def _fill(c: Outer) -> float:
-    c.y[1] = c.scale * c.inner.x
-    return c.inner.n + c.pair[1][0] + (100.0 if c.on else 0.0)
-
-
-@njit
-def _filled(c: Outer) -> float:
+def _filled(c):
     c = borrow(c)
-    return _fill(c)
-
-
-@njit
-def _sum_inner(c: Outer) -> float:
-    inner = borrow(borrow(c)).inner
-    return inner.x.sum()
-
-
-@njit
-def _swapped(c: Alike) -> None:
-    c = borrow(c)
-    for i in range(c.x.size):
-        c.x[i], c.y[i] = c.y[i], c.x[i]
-
-
-def test_a_borrowed_tuple_is_read_and_its_arrays_are_written_as_those_of_the_tuple_itself() -> None:
-    c = outer()
-    assert _filled(c) == 7 + 5.0 + 100.0
-    assert _filled(c._replace(on=False)) == 7 + 5.0
-    np.testing.assert_array_equal(c.y, [[0.0, 0.0, 0.0], [0.0, 0.5, 1.0]])
-
-
-def test_a_borrowed_one_borrowed_again_and_a_tuple_of_alike_arrays_are_the_same() -> None:
-    assert _sum_inner(outer()) == 3.0
-    c = Alike(np.arange(3.0), np.full(3, 9.0))
-    _swapped(c)
-    np.testing.assert_array_equal(c.x, 9.0)
-    np.testing.assert_array_equal(c.y, np.arange(3.0))
+    c.y[1] = c.pair[1][0] * c.x
+    return c.y.sum()
 
 
 def test_borrowing_leaves_every_reference_count_as_it_was() -> None:
-    c = outer()
-    arrays = (c.inner.x, *c.pair, c.y)
+    c = Outer(np.arange(3.0), (np.ones(2), np.full(2, 5.0)), np.zeros((2, 3)))
+    arrays = (c.x, *c.pair, c.y)
     before = [sys.getrefcount(x) for x in arrays]
-    for _ in range(100):
-        _filled(c)
+    assert [_filled(c) for _ in range(100)] == [15.0] * 100
     assert [sys.getrefcount(x) for x in arrays] == before
-
-
-def test_a_name_that_the_tuple_does_not_have_is_refused_when_it_is_compiled() -> None:
-    @njit
-    def wrong(c: Outer) -> float:
-        return borrow(c).missing
-
-    with pytest.raises(TypingError, match="missing"):
-        wrong(outer())
-
-
-@jit
-def _of_outer(c: Outer, factor: float) -> float:
-    return factor * c.scale
-
-
-@jit
-def _of_alike(c: Alike, factor: float) -> float:
-    return factor * c.x.sum()
-
-
-_chosen = jit_by_kind(Outer=_of_outer, Alike=_of_alike)
-
-
-@njit
-def _either(c: Outer | Alike, is_borrowed: bool) -> float:
-    return _chosen(borrow(c), 2.0) if is_borrowed else _chosen(c, 3.0)
-
-
-def test_a_function_by_kind_is_that_of_the_tuples_class_borrowed_or_not() -> None:
-    alike = Alike(np.arange(3.0), np.zeros(3))
-    assert _either(outer(), True) == 2.0 * 0.5
-    assert _either(outer(), False) == 3.0 * 0.5
-    assert _either(alike, True) == 2.0 * 3.0
-    assert _either(alike, False) == 3.0 * 3.0

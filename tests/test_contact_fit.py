@@ -1,7 +1,5 @@
 """Fits of a contact find true values again, cover them with their intervals, and say what the data cannot tell."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -12,7 +10,7 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
-from scenes import CIRCUITS, cases, covers, deck, shipped
+from scenes import CIRCUITS, cases, covers, deck, listed, shipped
 
 TRUE = {"alpha": 48.0, "m_exp": 0.45, "beta": 40.0, "n_exp": 1.6, "mu": 0.35, "c2": 4000.0}
 FN = np.geomspace(0.1, 2.0, 10)
@@ -210,23 +208,7 @@ def test_the_command_reads_the_tables_of_the_examples(command: Command, tmp_path
 AREAS = {"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}
 
 
-@pytest.mark.parametrize(
-    ("data", "options", "said"),
-    [
-        ({"fn": [1.0]}, {}, "the data have the columns fn; allowed: one of area, area_sliding, f_t"),
-        ({"fn": [1.0], "area": [3e-5]}, {}, "1 data cannot tell 2 parameters"),
-        ({"fn": [1.0, 2.0], "area": [3e-5, -1.0]}, {}, "the smallest area is -1; allowed: more than 0"),
-        ({"load": [1.0, 2.0], "area": [3e-5, 4e-5]}, {}, "a column 'load'; allowed: area, area_sliding, f_t, fn"),
-        ({"area": [3e-5], "f_t": [0.1], "sigma": [0.1]}, {}, "'sigma': which of the measured columns it belongs to"),
-        ({"indentation": [1e-3] * 2, "u_gap": [1.0, 2.0], "area": [3e-5] * 2}, {}, "indentations without voltage"),
-        (5.0, {}, "data is a float; allowed: a mapping of columns"),
-        (AREAS, {"parameters": ["alpha", "Xgap.alpha"]}, "alpha is named twice"),
-        (AREAS, {"parameters": ["d"]}, "parameters is 'd'; allowed: alpha, m_exp"),
-        (AREAS, {"finger": "Xno"}, "finger is 'Xno'; allowed: the name of a GAP"),
-        (AREAS, {"bounds": {"mu": (0.1, 1.0)}}, r"bounds names Xgap\.mu, which"),
-        ("fn (kg),area (mm^2)\n0.1,20\n1,40\n", {}, r"the unit of column 'fn' is 'kg'; allowed: N, with k, m"),
-    ],
-)
+@pytest.mark.parametrize(("data", "options", "said"), listed("contact_fits"))
 def test_bad_requests(circuit: fs.Circuit, tmp_path: Path, data: object, options: dict[str, object], said: str) -> None:
     if isinstance(data, str):
         (tmp_path / "a.csv").write_text(data)

@@ -1,7 +1,5 @@
 """Conversion of netlist text to flat, evaluated statements."""
 
-from __future__ import annotations
-
 import random
 import re
 import subprocess
@@ -17,18 +15,7 @@ from fingerspice.netlist.deck import parse_deck
 from fingerspice.netlist.expressions import Call, Number, Token
 from fingerspice.netlist.reader import Deck, Statement, text_of
 from ngspice_tools import call_ngspice
-
-PAPER = """Fingerpad on a 3M-coated touchscreen, Table 1
-.include fingerspice.lib
-Vdrive  drive 0          SIN(0 200 100)
-Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg
-Xgap    top   skin area  GAP   d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4
-+ m_exp=0.52 beta=32 n_exp=1.41 c2=5000   ; Table 1
-Xskin   skin  gnd  AREA  SKIN  d=350u f=100
-.tran 10u 50m uic
-.nodeset v(area)=34.97
-.end
-"""
+from scenes import DECKS, listed
 
 
 def deck(*lines: str) -> Deck:
@@ -52,7 +39,7 @@ def value(item: object) -> float:
 
 
 def test_places_are_physical_lines_and_columns_also_on_continuations() -> None:
-    gap = parse_deck(PAPER).statements[2]
+    gap = parse_deck((DECKS / "continued.cir").read_text("utf-8")).statements[2]
     assert gap.where == Where("<netlist>", 5, 1)
     assert gap.params["m_exp"].key == Where("<netlist>", 6, 3)
     assert gap.params["c2"].where == Where("<netlist>", 6, 36)
@@ -182,34 +169,7 @@ def test_text_after_the_end_and_uncalled_subcircuits_are_warned_about() -> None:
     ]
 
 
-REFUSED = {
-    "L1 a b 1m": "is an inductor, which is not supported; elements are R, C, V, I", "tran 1u 1m": "begins with a dot",
-    "5 a b 1": "'5' is no element", ",": "is no element", "(": "is no element", ".": "is not supported",
-    "R1": "missing node", "R1 a": "missing node", "R1 a b": "missing value", "R1 = 5": "the name before '='",
-    "R1 a b (5": r"'\(' is never closed", "R1 a b 5)": "without an opening", "R1 a b 5}": "without an opening",
-    "R1 a b '5": "' is never closed", 'V1 a b "x': '" is never closed', "R1 a {b} 5": "where a node's name belongs",
-    "V1 a b SIN(0 sin(3) 1)": "arithmetic goes in braces", "X1": "needs nodes",
-    "X1 a b area LAYER 1u": "follows the device LAYER", 'X1 a b area "LAYER"': "where a device's name belongs",
-    "X1 a b area LAYER d=1u D=2u": "given twice, first at <netlist>:2:19",
-    "X1 a b area LAYER 1d=1": "cannot be a parameter's name", "+ foo": "there is none",
-    ".param": "write .param name=value", ".param x": "write .param name=value", ".param x=": "missing value of 'x'",
-    ".param =3": "name before '='", ".param f(x)=x": "functions are not supported", ".param x={1": "never closed",
-    ".param x={1}+2": "belongs inside", ".param x=1 2": "operator is missing",
-    ".param x=1\n.param X=2": "defined twice, first at <netlist>:2:8", ".param x=x": "in a circle: x -> x",
-    ".param a=b b=c c=d d=b": "in a circle: d -> b -> c -> d", ".subckt": "write .subckt NAME",
-    ".subckt A a b": "without its .ends", ".subckt A a a\n.ends": "given twice", ".subckt A 0\n.ends": "ground",
-    ".subckt A a w=1 b\n.ends": "nodes come first", ".subckt A a\n.ends B": "the names differ",
-    ".subckt A a\n.ends\n.subckt a b\n.ends": "defined twice, first at <netlist>:2:1",
-    ".subckt A a\nX1 a B\n.ends\n.subckt B a\nX1 a A\n.ends\nX1 b A": "calls itself: A -> B -> A",
-    ".subckt A a wide=1\n.ends\nX1 b A wid=2": "did you mean 'wide'",
-    ".subckt A a b\n.ends\nX1 c A": r"A has 2 nodes \(a b\), 1 given", ".ends": "without a .subckt",
-    ".include": "needs a file name", ".include 'foo": "never closed", ".include a b": "in quotes",
-    ".include foo.lib": "no folder to look in", ".lib foo bar": "sections", ".control\nfoo": "without its .endc",
-    ".endc": "without a .control", ".ic v(a=3": "never closed", ".ic v(a)=": "missing value of 'v",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("text", "message"), REFUSED.items())
+@pytest.mark.parametrize(("text", "message"), listed("lines"))
 def test_what_is_wrong_is_refused_with_its_place(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         parse_deck(f"title\n{text}\n")
@@ -239,36 +199,6 @@ def test_work_grows_with_the_deck_and_not_faster() -> None:
     assert calls(1500, "long") < 3.05 * calls(500, "short")
 
 
-# Names of parameters in nested calls mean what they mean in ngspice 39, or are refused
-
-INNER = ".subckt inner a b\nR1 a b {w}\n.ends\n"
-MID = ".subckt mid a b\nX1 a b inner\n.ends\n"
-OUTER = ".subckt outer a b w=5\nX1 a b inner\n.ends\nX1 a 0 outer"
-OWN = ".subckt outer a b\n.param w=5\nX1 a b inner\n.ends\nX1 a 0 outer"
-CASES = {
-    "the caller's default": f".param w=7\n{INNER}{OUTER}",
-    "the caller's given value": f".param w=7\n{INNER}{OUTER} w=3",
-    "the caller's .param": f".param w=7\n{INNER}{OWN}",
-    "the caller's caller's": f".param w=7\n{INNER}{MID}{OUTER.replace('b inner', 'b mid')}",
-    "nobody's but the caller's": f"{INNER}{OWN}",
-    "the deck's from another call": f".param w=7\n{INNER}{OUTER.replace('0 outer', '0 inner')}",
-    "a bare name": f".param w=7\n{INNER.replace('{w}', 'w')}{OUTER}",
-    "a default": f".param w=7\n.subckt inner a b z={{w+1}}\nR1 a b {{z}}\n.ends\n{OUTER}",
-    "a .param inside": f".param w=7\n.subckt inner a b\n.param z={{w}}\nR1 a b {{z}}\n.ends\n{OUTER}",
-    "the deck's own formula": f".param w=7 z={{2*w}}\n{INNER.replace('{w}', '{z}')}{OUTER}",
-    "a name handed on": (
-        f".param w=7\n.subckt inner a b w=4\nR1 a b {{w}}\n.ends\n{OUTER.replace('b inner', 'b inner w={2*w}')}"
-    ),
-    "a definition inside, called from beside it": (
-        f".param w=7\n.subckt outer a b w=5\n{INNER}{MID.replace('a b', 'a b w=9', 1)}X1 a b mid\n.ends\nX1 a 0 outer"
-    ),
-    "what two callers hand down": (
-        ".subckt inner a b\n.param y={w*2}\nR1 a b {y}\n.ends\n.subckt outer a b\n.param w={q}\nX1 a b inner\n.ends\n"
-        ".subckt top a b q=3\nX1 a b outer\n.ends\nX1 a 0 top"
-    ),
-}
-
-
 def theirs(body: str, folder: Path) -> float:
     """The resistance between a and 0 that ngspice finds, ohm."""
     text = f"a resistance\n{body}\nI1 0 a DC 1\n.op\n.control\nrun\nset numdgt=12\nprint v(a)\nquit 0\n.endc\n.end\n"
@@ -286,9 +216,9 @@ def ours(body: str) -> float:
     return float(value.value)  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_an_undefined_name_is_the_callers_as_in_ngspice(name: str, tmp_path: Path) -> None:
-    assert ours(CASES[name]) == pytest.approx(theirs(CASES[name], tmp_path), rel=1e-6)
+@pytest.mark.parametrize(("name", "body"), listed("callers"), ids=[name for name, _ in listed("callers")])
+def test_an_undefined_name_is_the_callers_as_in_ngspice(name: str, body: str, tmp_path: Path) -> None:
+    assert ours(body) == pytest.approx(theirs(body, tmp_path), rel=1e-6)
 
 
 def nest(rng: random.Random) -> str:
@@ -340,9 +270,6 @@ def test_a_value_whose_name_ngspice_takes_inside_is_refused(call: str, said: str
 def test_a_value_that_is_the_same_inside_is_taken(tmp_path: Path) -> None:
     body = ".param w=7\n.subckt s a b w=4 v=1\nR1 a b {v*w}\n.ends\nX1 a 0 s w={w} v={w+1}"
     assert ours(body) == theirs(body, tmp_path) == 56.0
-
-
-# Files
 
 
 def test_local_files_are_included_and_named_in_places(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 Run as a program, this file prints a digest of every scene, for processes with other settings.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -25,14 +23,9 @@ import scipy.integrate
 
 import fingerspice as fs
 from fingerspice.plots.drawing import save
-from scenes import cases, every_law, shipped, table1
+from scenes import DECKS, cases, every_law, shipped, table1
 
-DRY = """no layer leaks
-Vdrive drive 0 SIN(0 200 100)
-Xcoat drive top area LAYER d=1u eps_r=3.9
-Xgap top 0 area GAP d=3.5u eps_r=1 fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
-.tran 50u 20m uic
-"""
+DRY = (DECKS / "dry.cir").read_text()
 
 
 def wobble(t: Any) -> Any:
@@ -169,9 +162,6 @@ def test_a_value_does_not_depend_on_which_others_or_whether_the_charge_are_asked
         expected = arrays(with_charge)
         for signal, values in arrays(without).items():
             np.testing.assert_array_equal(values, expected[signal], err_msg=signal)
-
-
-# Threads
 
 
 def at_once(work: list[Callable[[], str]], threads: int = 8) -> list[str]:

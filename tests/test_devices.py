@@ -1,7 +1,5 @@
 """Every device of the registry: its subcircuit in both ngspice libraries describes the same circuit as the entry."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

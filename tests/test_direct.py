@@ -3,8 +3,6 @@
 Also what they make of samples: the response of linear modes, against extended precision, mpmath and ramps.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable
@@ -237,16 +235,6 @@ def test_samples_at_other_times_are_taken_there(shift: float) -> None:
     assert np.abs(quick.u_layer - slow.u_layer).max() <= quick.error.u_gap + slow.error.u_gap + 1e-12 * 60.0
 
 
-@pytest.mark.parametrize("keep", [slice(0, 200), slice(1, None), slice(0, None, 2)])
-def test_some_of_the_samples_times_are_as_good_as_all(keep: slice) -> None:
-    values = np.random.default_rng(8).normal(0.0, 60.0, 401)
-    t = np.arange(401) / 48e3
-    source = fs.Samples(values, 48e3)
-    whole = linear(source, t, 400 / 48e3, charge=False)
-    some = linear(source, t[keep], float(t[keep][-1]), charge=False)
-    assert np.abs(some.u_layer - whole.u_layer[keep]).max() <= 1e-12 * np.abs(values).max()
-
-
 def layered(rng: np.random.Generator, layers: int) -> tuple[fs.Circuit, list[ref.Layer]]:
     """A stack of random layers at a sine of 10 V and 500 Hz, and its layers as the reference takes them."""
     d, eps, r = rng.uniform(1e-6, 1e-4, layers), rng.uniform(1.0, 50.0, layers), 10.0 ** rng.uniform(5.0, 7.0, layers)
@@ -317,24 +305,6 @@ def test_a_run_goes_on_from_where_another_stopped(tier: str, cut: float, start: 
     assert np.abs(second.q_source - whole.q_source[t >= cut]).max() <= 1e-12 * q
 
 
-@pytest.mark.parametrize("tier", CIRCUITS)
-def test_a_source_that_stops_being_finite_ends_the_run_there(tier: str) -> None:
-    def source(t: Any) -> Any:
-        return np.where(np.asarray(t) < 0.00412345, np.sin(2e3 * np.asarray(t)), np.nan)
-
-    circuit = deck("V1 in 0 1", *CIRCUITS[tier])
-    solution = fs.simulate(circuit, sources={"V1": source}, throw=False)
-    assert solution.method == tier
-    assert solution.status is fs.Status.SOURCE_NOT_FINITE
-    assert 0.0041 <= solution.t[-1] <= 0.0041235
-    assert solution.state.t == pytest.approx(0.00412345, abs=1e-9)
-    assert np.all(np.isfinite(solution.state.y))
-    assert solution.state.s_before[0] == pytest.approx(math.sin(2e3 * 0.00412345), abs=1e-5)
-    assert np.all(np.isfinite(solution.u_layer))
-    want = fs.simulate(circuit, sources={"V1": lambda t: np.sin(2e3 * np.asarray(t))})
-    np.testing.assert_allclose(solution.u_layer, want.u_layer[: solution.t.size], rtol=0, atol=1e-10)
-
-
 @every_law
 @pytest.mark.parametrize("at", [0.004, 0.00412345, 0.011], ids=["on an output", "between", "late"])
 @pytest.mark.parametrize("tier", [*CIRCUITS, "coupled"])
@@ -369,39 +339,6 @@ def test_a_source_that_is_never_finite_leaves_the_state_as_it_was(tier: str) -> 
 # The periodic state, and areas by their names -------------------------------------------------------------------
 
 
-def fundamental(solution: fs.Solution, x: np.ndarray, f: float) -> complex:
-    """Complex amplitude of x ~ Im(P exp(i 2 pi f t)) over one period on an even grid."""
-    t, x = solution.t[:-1], x[:-1]
-    return complex(2j * np.mean(x * np.exp(-2j * np.pi * f * t)))
-
-
-@pytest.mark.filterwarnings("ignore:.*outside 10 Hz to 100 kHz")
-@pytest.mark.parametrize("f", [1.0, 10.0, 100.0, 1e3, 5e3, 1e4, 1e5])
-@every_law
-def test_periodic_sine_equals_eq_11_in_amplitude_and_phase(f: float, law: str) -> None:
-    circuit = table1(f"SIN(0 200 {f!r})", f)
-    solution = fs.steady_state(circuit, area=AREA, charge_law=law, rtol=1e-12, points=400).solution
-    gains = ref.phasor_gains(f, AREA, ref.table1_layers(f))
-    got = fundamental(solution, solution.u_gap, f) / 200.0
-    assert abs(got - gains[ref.GAP]) <= 1e-10 * abs(gains[ref.GAP])
-    peak = 200.0 * abs(gains[ref.GAP])
-    wave = peak * np.sin(2.0 * np.pi * f * solution.t + np.angle(gains[ref.GAP]))
-    assert np.abs(solution.u_gap - wave).max() <= 1e-10 * peak
-
-
-@pytest.mark.parametrize(("f", "duty"), [(100.0, 0.5), (5000.0, 0.5), (500.0, 0.2)])
-@every_law
-def test_periodic_square_equals_the_matrix_exponential(f: float, duty: float, law: str) -> None:
-    circuit = table1(f"SQUARE(200 {f!r} {duty!r})", f)
-    solution = fs.steady_state(circuit, area=AREA, charge_law=law, rtol=1e-12, points=200).solution
-    # Both values at a jump have one time.
-    apart = np.append(False, np.diff(solution.t) > 0.0)
-    inside = apart & np.append(apart[1:], False)
-    phase = solution.t[inside] - solution.t[0]
-    expected = ref.square_frozen(f, 200.0, AREA, phase, layers=ref.table1_layers(f), duty=duty)
-    assert np.abs(solution.u_layer[inside] - expected).max() <= 1e-10 * 200.0
-
-
 def test_mean_and_frozen_areas_are_what_their_names_say() -> None:
     frozen = fs.simulate(table1(), area="frozen")
     assert frozen.area == pytest.approx(34.9715871843e-6, rel=1e-11, abs=0.0)
@@ -409,29 +346,6 @@ def test_mean_and_frozen_areas_are_what_their_names_say() -> None:
     assert mean.area == pytest.approx(ref.coupled_phasor(100.0, 200.0).area, rel=1e-12, abs=0.0)
     with pytest.raises(fs.InputError, match="this source has none"):
         fs.simulate(table1(), sources={"Vdrive": fs.DC(10.0)}, area="mean")
-
-
-@pytest.mark.filterwarnings("ignore:.*outside 10 Hz to 100 kHz")
-@pytest.mark.parametrize(
-    ("f", "skin", "limit"), [(0.01, 1.0, ref.gap_limit_eq14(1.0, AREA)), (1e8, 1e5, ref.gap_limit_eq15(1e5))]
-)
-def test_the_low_limit_is_resistive_and_the_high_one_capacitive_eqs_14_and_15(
-    f: float, skin: float, limit: float
-) -> None:
-    solution = fs.steady_state(table1(f"SIN(0 200 {f!r})", skin), area=AREA, rtol=1e-10, points=200).solution
-    assert abs(fundamental(solution, solution.u_gap, f)) / 200.0 == pytest.approx(limit, rel=1e-6)
-
-
-def test_a_pure_capacitor_stack_follows_the_source_without_delay() -> None:
-    lines = (
-        "V1 a 0 SIN(0 10 1k)", "X1 a b area LAYER d=1u eps_r=2", "X2 b 0 area LAYER d=3u eps_r=2", "Varea area 0 40"
-    )  # fmt: skip
-    solution = fs.simulate(deck(*lines, ".tran 10u 2m uic"))
-    assert np.abs(solution.u_layer[:, 0] - 0.25 * solution.u_source).max() <= 1e-13 * 10.0
-    c = 8.854e-12 * 2.0 * 40e-6 / 4e-6
-    assert np.abs(solution.q_source - c * solution.u_source).max() <= 1e-8 * c * 10.0
-    assert solution.f_el is None
-    assert solution.u_gap is None
 
 
 @every_law

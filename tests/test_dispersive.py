@@ -1,7 +1,5 @@
 """The dispersive stratum corneum: its ladder, its fit, and its effect in every tier."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -12,7 +10,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.describe import energy_outside
 from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
-from scenes import CIRCUITS, dispersive_deck, every_law, table1_deck
+from scenes import CIRCUITS, cases, dispersive_deck, every_law, table1_deck
 
 BAND = np.geomspace(*SKIN_BAND, 401)
 D = 350e-6
@@ -51,9 +49,6 @@ def gap_gain(f: np.ndarray) -> np.ndarray:
     return np.asarray(z[1] / (z[0] + z[1] + D / (y * AREA)))
 
 
-# The ladder -------------------------------------------------------------------------------------------------
-
-
 def test_the_ladder_is_equations_18_and_19_over_the_band() -> None:
     misfit = np.abs(SKIN_LADDER.admittivity(BAND) / admittivity(BAND) - 1.0)
     assert np.sqrt(np.mean(misfit**2)) <= 0.021
@@ -86,9 +81,6 @@ def test_the_libraries_hold_the_cells_of_the_package(library: str) -> None:
     assert body is not None
     slabs = re.findall(r"SLAB d=\{d\} eps_r=(\S+) rho=(\S+)", body.group())
     np.testing.assert_allclose(np.array(slabs, float).T, SKIN_LADDER.cells(), rtol=1e-12)
-
-
-# Fits -------------------------------------------------------------------------------------------------------
 
 
 def test_debye_terms_are_found_again() -> None:
@@ -145,9 +137,6 @@ def test_a_fitted_material_in_a_netlist_is_the_device_of_the_same_ladder(law: st
     assert np.abs(a.u_gap - b.u_gap).max() <= 1e-8 * np.abs(b.u_gap).max()
 
 
-# Tiers ------------------------------------------------------------------------------------------------------
-
-
 def periodic(waveform: fs.Waveform, t: np.ndarray) -> np.ndarray:
     """Gap voltage at phases t of the periodic state at AREA, by the linear tier."""
     assert waveform.period is not None
@@ -199,7 +188,7 @@ def test_am_and_noise_are_the_superposition_of_their_phasors() -> None:
 @every_law
 @pytest.mark.parametrize("shape", ["sine", "square"])
 def test_the_coupled_run_is_the_independent_references(shape: str, law: str) -> None:
-    f, periods, rtol = 100.0, 3, 1e-9
+    f, periods, rtol = 100.0, cases(3, 1), 1e-9
     segments, waveform = ref.square_segments(200.0, f, periods), fs.Square(200.0, f)
     if shape == "sine":
         segments, waveform = ref.sine_segments(200.0, f, periods / f), fs.Sine(200.0, f)
@@ -232,9 +221,6 @@ def test_the_periodic_state_is_reached_from_the_operating_point_too(law: str) ->
     assert np.abs(late.u_gap - state.solution.u_gap[:-1]).max() <= 3e-8 * peak
 
 
-# What the plan picks ----------------------------------------------------------------------------------------
-
-
 def test_a_loose_error_lets_a_sine_take_the_skin_at_its_frequency() -> None:
     circuit = dispersive()
     loose = fs.simulate(circuit, rtol=0.1, t_stop=0.05)
@@ -253,9 +239,6 @@ def test_no_single_frequency_stands_for_a_broad_spectrum_and_a_plain_skin_is_not
         assert any("skin dispersive" in r for r in plan.reasons)
     plan = fs.plan(fs.parse_netlist(table1_deck()), rtol=0.1)
     assert not any("skin" in r for r in plan.reasons)
-
-
-# Warnings ---------------------------------------------------------------------------------------------------
 
 
 OUTSIDE = {

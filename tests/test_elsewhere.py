@@ -1,7 +1,5 @@
 """Decks written for LTspice, ngspice or by other authors: the supported ones load, the others get clear messages."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings
@@ -18,8 +16,10 @@ from fingerspice.circuit.circuit import Tran
 from fingerspice.netlist.lexer import decimal_comma
 from fingerspice.netlist.reader import ELSEWHERE, LIBRARIES, library_text
 from ngspice_tools import call_ngspice, run_ngspice, with_max_step
+from scenes import DECKS, listed
 
 TRAN = ".tran 10u 50m uic"
+OTHERS = sorted((DECKS / "others").glob("*.cir"))
 
 
 def read(*changes: tuple[str, str]) -> tuple[fs.Circuit, list[str]]:
@@ -30,29 +30,9 @@ def read(*changes: tuple[str, str]) -> tuple[fs.Circuit, list[str]]:
     return circuit, [str(w.message) for w in caught]
 
 
-# LTspice
-
-#: As LTspice XVII saves a schematic: Latin-1, CRLF, SINE, two numbers less in .tran, parasitics, parts' data.
-LTSPICE = """\
-* C:\\Users\\M\xfcller\\finger.asc
-V1 N001 0 SINE(0 200 100) Rser=1k
-XU1 N001 N002 area LAYER d=1\xb5 eps_r=3.9 r=0.2Meg
-XU2 N002 N003 area GAP d=3.5\xb5 r=1Meg
-XU3 N003 0 area SKIN d=350\xb5m f=100
-R1 N001 0 10Meg tol=1 pwr=0.1
-C1 N001 0 100p V=250 Irms=0 Rser=50 Rpar=1G Cpar=1p mfg="KEMET" pn="C0402" type="X7R"
-.tran 0 20m 0 10\xb5
-.lib fingerspice.lib
-.options plotwinsize=0 numdgt=7
-.backanno
-.end
-"""
-
-
-def test_what_ltspice_saves_loads_and_is_the_same_circuit_as_ours(tmp_path: Path) -> None:
-    path = tmp_path / "finger.net"
-    path.write_bytes(LTSPICE.replace("\n", "\r\n").encode("latin-1"))
-    theirs = fs.read_netlist(path)
+def test_what_ltspice_saves_loads_and_is_the_same_circuit_as_ours() -> None:
+    # As LTspice XVII saves a schematic: Latin-1, CRLF, SINE, two numbers less in .tran, parasitics, parts' data.
+    theirs = fs.read_netlist(DECKS / "ltspice.net")
     assert theirs.title == "* C:\\Users\\M\xfcller\\finger.asc"
     assert theirs.warnings == ()
     assert theirs.unused == (".options plotwinsize", ".options numdgt")
@@ -136,20 +116,10 @@ def test_a_run_whose_source_has_ac_alone_is_warned_about(beside: str) -> None:
         fs.simulate(circuit, t_stop=1e-4)
 
 
-def test_a_misspelt_library_is_told_of_ours(tmp_path: Path) -> None:
-    path = tmp_path / "deck.cir"
-    path.write_text(edited(("fingerspice.lib", "finger_spice.lib")))
-    with pytest.raises(fs.InputError, match=r"'finger_spice.lib' does not exist; did you mean 'fingerspice.lib'\?"):
-        fs.read_netlist(path)
-
-
 def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
     path = tmp_path / "finger.net"
     path.write_bytes(DECK.replace("3.5u", "3.5\u00b5").encode("utf-16"))
     assert fs.read_netlist(path)["Xgap"].values["d"] == 3.5e-6
-
-
-# R, C and GAP as ngspice takes them
 
 
 @pytest.mark.parametrize(("line", "value"), [
@@ -182,9 +152,6 @@ def test_a_gap_has_the_librarys_defaults_which_are_table_1() -> None:
     assert fs.simulate(short, area="frozen", t_stop=1e-3).area[0] == pytest.approx(float(ref.area(0.0)), rel=1e-12)
 
 
-# What is said
-
-
 @pytest.mark.parametrize("word", ELSEWHERE)
 def test_a_directive_of_another_simulator_says_the_way_here(word: str) -> None:
     with pytest.raises(fs.InputError) as caught:
@@ -201,13 +168,6 @@ def test_what_only_ngspice_or_ltspice_needs_is_not_worth_a_word(word: str, comma
     assert not command("run", "pad.cir", "--no-plot").lines
 
 
-DOUBTFUL = {
-    "V1 a 0 SIN(0 200 0,1)": "0,1 is two numbers, 0 and 1, for a comma separates; if it is a decimal comma write 0.1",
-    "X1 a b c LAYER d=3,5u eps_r=1": "write 3.5u", "X1 a b c LAYER d= 3,5um eps_r=1": "write 3.5um",
-    "V1 a 0 PULSE(0 5 0 1,5n 1n 1m 2m)": "write 1.5n", "V1 a 0 PULSE 0 5 0 -1,5n 1n": "write -1.5n",
-    ".tran 10u 0,05 uic": "write 0.05", ".param w=3,5u": "write 3.5u", "R1 a b 3,5k": "write 3.5k",
-    "R1 1 2 3,5k": "write 3.5k", "V1 a 0 DC 1,5": "write 1.5", ".ac dec 10 0,5 100k": "write 0.5",
-}  # fmt: skip
 RIGHT = [
     *("V1 a 0 SIN(0,200,100)", "V1 a 0 SIN(0, 200, 100)", "V1 a 0 PWL(0,0 1m,5 2m,0)", "V1 a 0 PWL(0 0, 1m 5, 2m 0)"),
     *("R1 1,2 10k", "R1 a b {max(1,2)*1k}", "R1 a b '1k*max(1,2)'", ".param w={min(3,5)}", ".ic v(a)=1, v(b)=2"),
@@ -215,19 +175,10 @@ RIGHT = [
 ]
 
 
-@pytest.mark.parametrize(("line", "said"), [*DOUBTFUL.items(), *((line, None) for line in RIGHT)])
+@pytest.mark.parametrize(("line", "said"), [*listed("commas"), *((line, None) for line in RIGHT)])
 def test_a_decimal_comma_is_named_and_a_comma_that_separates_is_right(line: str, said: str | None) -> None:
     found = decimal_comma(line)
     assert found is None if said is None else (found or "").endswith(said)
-
-
-def test_a_decimal_comma_that_makes_another_circuit_is_warned_about() -> None:
-    circuit, said = read(("SIN(0 200 100)", "SIN(0,5 200 100)"))
-    assert circuit["Vdrive"].waveform == fs.Sine(5.0, 200.0, 0.0, delay=100.0) or said
-    assert any("0,5 is two numbers, 0 and 5" in text for text in said)
-
-
-# The library beside the deck
 
 
 @pytest.mark.parametrize("name", LIBRARIES.values())
@@ -264,108 +215,10 @@ def test_a_library_outside_the_decks_folder_is_not_looked_at(tmp_path: Path) -> 
     assert fs.read_netlist(path).warnings == ()
 
 
-# Files of schematic tools --------------------------------------------------------------------------------------
-
-NAMES = ["D[0]", "A<3>", "unconnected-(U1-NC-Pad4)", "/OUT(+)", "Net-(C1-Pad1)", "/sub/a~b", "N$1", "+V"]
-DECKS = {
-    "KiCad, Eagle and busses": """.title names
-V1 in 0 PULSE(0 1 1u 10n 10n 5u 10u)
-"""
-    + "".join(f"R{i} in {name} 1k\nC{i} {name} 0 {i}n\n" for i, name in enumerate(NAMES, 1))
-    + ".ic v(unconnected-(U1-NC-Pad4))=0.5\n.tran 10n 20u uic",
-    "PySpice": """.title Low-Pass RC Filter
-Vinput in 0 DC 0V AC 1V SIN(0V 1V 50kHz 0s 0Hz)
-R1 in out 1kOhm
-C1 out 0 1nF
-.options TEMP = 25°C
-.options TNOM = 25°C
-.ic
-.tran 100ns 40us 0s uic
-""",
-    "start values inside a subcircuit": """starts
-.subckt cell a b params: x0=0.5
-Ra a m 10k
-Cm m 0 1u
-Rb m b 10k
-.ic v(m)={x0} v(b)={x0/2}
-.ends
-V1 in 0 DC 0
-X1 in out cell x0=2V
-Cl out 0 1u
-X2 in top cell
-Rt top 0 5k
-.tran 10u 20m uic
-""",
-    "a discharge without a source": """Human body of 5 kV touches a device of 5 pF
-Cbody b 0 100p IC=5k
-Rbody b d 1.5k
-Cdev d 0 5p
-.tran 0.05n 50n uic
-""",
-    "IC= goes before .ic": """A charged capacitor between resistors
-r1 a 0 1
-r2 b 0 1
-c1 a b 1m ic=1V
-.ic v(a)=10V v(b)=1V
-.tran 10u 10m uic
-""",
-    "xschem": """** sch_path: /home/me/rc.sch
-**.subckt rc
-R1 out IN 10k m=1
-C1 out GND 10n m=1
-V1 IN GND pulse(0 1 1n 1n 1n 5m 10m)
-**** begin user architecture code
-.tran 10u 20m uic
-**** end user architecture code
-**.ends
-.GLOBAL GND
-.end
-""",
-    "Qucs-S": """* Qucs 24.2.0
-V1 _net0 0 DC 10
-R1 _net0 out 1K tc1=0.0 tc2=0.0
-C1 out 0 1U IC=0
-.tran 5e-06 0.005 0 uic
-.END
-""",
-    "KiCad 7": """.title KiCad schematic
-.save all
-.probe alli
-.tran 1u 10m
-V1 /in GND DC 0 SIN( 0 1 1k 0 0 0 ) AC 1
-R1 /in Net-_C1-Pad1_ 1k
-C1 Net-_C1-Pad1_ GND 100n
-.end
-""",
-    "PSpice": """* source FILTER
-V_V1 N14847 0
-+PULSE 0V 5V 3.67us 40ns 40ns 3.255us 6.51us
-V_V2 N14651 0 5Vdc
-R_R2 N14847 N14538 2.2k
-C_C1 N14538 0 1n
-R_R3 N14538 N14651 1k
-.TRAN 0.1u 30u uic
-.END
-""",
-    "an electrostatic chuck of two RC layers": """* Johnsen-Rahbek
-.PARAM VCH=500 RB=50MEG CB=2NF RG=2G CG=20NF
-VCHUCK CH 0 PWL(0 0 1M {VCH} 500M {VCH} 501M 0 502M {-VCH/10} 600M {-VCH/10} 601M 0)
-RSUP CH N1 100K
-XL N1 N2 RC R={RB} C={CB}
-XG N2 0 RC R={RG} C={CG}
-.SUBCKT RC A B R=1 C=1
-R1 A B {R}
-C1 A B {C}
-.ENDS RC
-.TRAN 1M 1 uic
-.END
-""",
-}
-
-
 @pytest.mark.filterwarnings("ignore:.*(has no effect here|usual range)")
-@pytest.mark.parametrize("text", DECKS.values(), ids=DECKS)
-def test_decks_of_other_tools_have_ngspices_voltages(text: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("path", OTHERS, ids=lambda path: path.stem)
+def test_decks_of_other_tools_have_ngspices_voltages(path: Path, tmp_path: Path) -> None:
+    text = path.read_text("utf-8")
     circuit = fs.parse_netlist(text)
     stop = circuit.tran.stop
     block = (
@@ -385,5 +238,5 @@ def test_decks_of_other_tools_have_ngspices_voltages(text: str, tmp_path: Path) 
 
 
 def test_a_pulse_charges_what_hangs_on_a_name_with_brackets() -> None:
-    s = fs.simulate(fs.parse_netlist(DECKS["KiCad, Eagle and busses"]), t_eval=[1.005e-6 + 4e-6])
+    s = fs.simulate(fs.read_netlist(DECKS / "others" / "kicad_eagle_busses.cir"), t_eval=[1.005e-6 + 4e-6])
     assert s.node_voltages["Net-(C1-Pad1)"][0] == pytest.approx(1.0 - math.exp(-4.0 / 5.0), rel=1e-5)

@@ -1,10 +1,11 @@
-"""The stated error: between the true error and 10 times the true error, on 95 % of random scenes."""
+"""The stated error on random scenes, and the script that judges random scenes."""
 
-from __future__ import annotations
-
+import dataclasses
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 import stress
-from scenes import cases, every_law, table1
+from scenes import cases, every_law, listed, table1
 
 N = cases(100, 12)
 PERIODS = 2
@@ -159,3 +160,95 @@ def test_the_errors_of_area_and_friction_follow_from_those_of_voltage_and_force(
         assert np.abs(run.area - exact.area).max() <= slope * run.error.u_gap + 1e-13 * exact.area.max()
         # This keeps the area to rtol as well.
         assert slope * run.error.u_gap < rtol * exact.area.max()
+
+
+FIRST = 60
+
+
+@pytest.mark.parametrize("number", range(FIRST, FIRST + cases(60, 8)))
+def test_a_random_scene_is_right_or_refused_for_a_true_reason(number: int) -> None:
+    assert stress.judge(stress.draw(0, number))
+
+
+@pytest.mark.parametrize(
+    ("seed", "number", "end"), [*listed("mended"), *(listed("mended_others") if cases(1, 0) else [])]
+)
+def test_a_scene_that_was_wrong_or_endless_is_mended(seed: int, number: int, end: str) -> None:
+    assert stress.judge(stress.draw(seed, number)).end == end
+
+
+@pytest.mark.filterwarnings("ignore:.*breaks down")
+@pytest.mark.parametrize("number", [2540, 2975])
+def test_a_first_step_of_a_1e20th_of_the_run_is_an_exponential_one(number: int) -> None:
+    scene = stress.draw(0, number)
+    with np.errstate(all="ignore"):
+        solution = fs.simulate(scene.circuit, charge_law=scene.law, rtol=1e-6, method="exponential")
+        expected = scene.expected(solution.t).u_gap
+    turns = 2.0 * scene.frequency * solution.t
+    missed = np.abs(solution.u_gap - expected)[np.abs(turns - np.rint(turns)) > 1e-6]  # A jump has two sides.
+    assert missed.max() <= stress.REFERENCE * scene.amplitude
+
+
+def test_scenes_reach_over_twelve_decades_and_repeat() -> None:
+    scenes = [stress.draw(0, k) for k in range(cases(2000, 500))]
+    assert stress.draw(0, 7) == scenes[7]
+    resistances = np.array([r for s in scenes for r in s.r if np.isfinite(r)])
+    assert resistances.min() < 1e-2
+    assert resistances.max() > 1e14
+    for values, low, high in (
+        ([s.amplitude for s in scenes], 1e-8, 1e4),
+        ([s.frequency for s in scenes], 1e-2, 1e5),
+        ([s.f_n for s in scenes], 1e-4, 10.0),
+        ([d for s in scenes for d in s.d], 1e-8, 1e-4),
+    ):
+        assert min(values) < low
+        assert max(values) > high
+    assert all(0.0 < s.m < s.n and 1.0 / s.m + 1.0 / s.n > 1.0 for s in scenes)
+
+
+def test_a_scene_judged_by_another_one_s_reference_is_wrong() -> None:
+    scene = next(s for s in (stress.draw(0, k) for k in range(FIRST, FIRST + 60)) if s.touches and s.law == "local")
+
+    @dataclasses.dataclass(frozen=True)
+    class Another(stress.Scene):
+        def expected(self, t, tol=1e-11):
+            return dataclasses.replace(scene, amplitude=1.001 * scene.amplitude).expected(t, tol)
+
+    with pytest.raises(stress.WrongError, match="u_gap is off by"):
+        stress.judge(Another(**dataclasses.asdict(scene)))
+
+
+@pytest.mark.parametrize(
+    ("signal", "share", "said"),
+    [("force", 1e-4, "f_el is off by"), ("area", 1e-4, "area is off by"), ("q", 1e-4, "q_source is off by"),
+     ("q", 1e-5, "times what is stated"), ("force", 1e-11, ""), ("q", 1e-11, "")],
+)  # fmt: skip
+@pytest.mark.parametrize("number", [62, 67][: cases(2, 1)])
+def test_force_area_charge_and_stated_errors_are_judged(number: int, signal: str, share: float, said: str) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Wrong(stress.Scene):
+        def expected(self, t, tol=1e-11):
+            run = super().expected(t, tol)
+            return dataclasses.replace(run, **{signal: (1.0 + share) * getattr(run, signal)})
+
+    scene = Wrong(**dataclasses.asdict(stress.draw(0, number)))
+    if said:
+        with pytest.raises(stress.WrongError, match=said):
+            stress.judge(scene)
+    else:
+        assert stress.judge(scene).end == "right"
+
+
+def test_the_counts_are_written_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "counts.json"
+    assert stress.main(["--scenes", "3", "--first", "60", "--json", str(path)]) == 0
+    found = json.loads(path.read_text())
+    assert (found["seed"], found["first"], found["scenes"]) == (0, 60, 3)
+    assert sum(found["counts"].values()) == 3
+    assert found["wrong"] == {}
+    right = found["counts"]["right"]
+    assert right > 0
+    for name in ("u_gap", "f_el", "q_source"):
+        assert found["stated"][name]["judged"] == right
+        assert found["stated"][name]["exceeded"] == len(found["stated"][name]["worst"])
+    assert f"{right:7d} right" in capsys.readouterr().out

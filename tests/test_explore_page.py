@@ -1,7 +1,5 @@
 """The explorer's page in a real browser; skipped where Playwright or Chromium is missing."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 from collections.abc import Iterator
@@ -133,9 +131,7 @@ def test_every_slider_of_the_first_scene_moves_the_figures(page: Page) -> None:
         assert page.page.inner_text("#figures") != before, name
 
 
-def test_a_link_restores_the_scene_elsewhere_and_says_what_it_does_not_know(
-    page: Page, browser: Any, explorer: fs.Explorer
-) -> None:
+def test_a_link_restores_the_scene_elsewhere_and_says_what_it_does_not_know(page, browser, explorer):
     page.typed("Xgap.d", "4u")
     page.after(lambda: page.page.select_option("#kind", "SQUARE"))
     page.after(lambda: page.page.select_option("#charge_law", "mobile"))

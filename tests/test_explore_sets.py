@@ -1,7 +1,5 @@
 """Named sets of parameters on the explorer's page, and what was changed before it was opened."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

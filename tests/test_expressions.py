@@ -1,6 +1,4 @@
-"""Arithmetic of netlists."""
-
-from __future__ import annotations
+"""Numbers, arithmetic and engineering notation of netlists."""
 
 import contextlib
 import itertools
@@ -10,54 +8,33 @@ import re
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
 from deck_edits import evaluate
 from fingerspice.base.errors import InputError, Where
+from fingerspice.base.units import format_si, parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
 from ngspice_tools import call_ngspice
+from scenes import cases, listed
 
 HERE = Where("deck.cir", 3, 10)
 NAMES = {"thick": 2.0, "Rho": 3.0, "if": 5.0}
 
-# Values tried in ngspice 39.
-NGSPICE = {
-    "2*3.5u": 7e-6, "1meg/2": 5e5, "-2^2": -4.0, "-2**2": -4.0, "2^-1": 0.5, "(-2)^2": 4.0, "pow(-2,3)": -8.0,
-    "log(10)": math.log(10.0), "log10(10)": 1.0, "int(-2.7)": -2.0, "nint(2.5)": 2.0, "sqr(3)": 9.0,
-    "arctan(1)": math.atan(1.0), "sgn(-3)": -1.0, "2*-3": -6.0, "--3": 3.0, "2-3-4": -5.0, "1>2?3:4": 4.0,
-    "(2>1)?3:4": 3.0, "2>1": 1.0, "1&&0": 0.0, "1==1": 1.0, "ternary_fcn(1,2,3)": 2.0, "max(1,2)": 2.0,
-}  # fmt: skip
-WITH_NAMES = {
-    "THICK * rho": 6.0, "if + 1": 6.0, "PI": math.pi, "2*e": 2 * math.e, "0 ? 1 : 0 ? 2 : 3": 3.0,
-    "1 ? (2 ? 3 : 4) : 5": 3.0, "max(1 > 2 ? 3 : 4, 1)": 4.0, "thick == 0 ? 1/0 : 7": 7.0, "(2^3)^2": 64.0,
-    "2^3*2^2": 32.0, "1<2 && 2<3 || 0": 1.0, "atan2(1, 1)": math.pi / 4, "-(-(-(-(1))))": 1.0,
-    "1+" * 900 + "1": 901.0, "(" * 25 + "-1" + ")" * 25: -1.0,
-}  # fmt: skip
+
+LONG = [("1" + 900 * "+1", 901.0)]
 
 
-@pytest.mark.parametrize("text", [*NGSPICE, *WITH_NAMES])
-def test_arithmetic_means_what_ngspice_means_with_names_conditions_and_nesting(text: str) -> None:
-    assert evaluate(text, NAMES, HERE) == pytest.approx((NGSPICE | WITH_NAMES)[text], rel=1e-15)
+@pytest.mark.parametrize(("text", "value"), [*listed("arithmetic"), *listed("arithmetic_with_names"), *LONG])
+def test_arithmetic_means_what_ngspice_means_with_names_conditions_and_nesting(text: str, value: float) -> None:
+    assert evaluate(text, NAMES, HERE) == pytest.approx(value, rel=1e-15)
 
 
 @pytest.mark.parametrize(("text", "column", "message"), [
-    ("", 10, "empty"), ("2*", 12, "value is missing at the end"), ("*2", 10, "value is missing before"),
-    ("1 2", 12, "operator is missing before '2'"), ("sqrt(2", 14, "never closed"), ("2)", 11, "without an opening"),
-    ("1,2", 11, "outside the arguments"), ("max((1,2),3)", 16, "outside the arguments"),
-    ("thik*2", 10, "'thik' is not defined; did you mean 'thick'"), ("2*sqr t(2)", 16, "operator is missing"),
-    ("1+sqrtt(2)", 12, "not a function; did you mean 'sqrt'"), ("zzz(2)", 10, "functions are sqrt"),
-    ("sqrt", 10, r"written sqrt\(\.\.\.\)"), ("sin(1,2)", 10, "takes 1 argument, 2 given"),
-    ("min(1)", 10, "takes 2 arguments, 1 given"), ("1/0", 10, "divides by zero"), ("exp(1e9)", 10, "too large"),
-    ("9.0**9e9", 10, "leaves the domain|too large"), ("1e308*10", 10, "not a finite"),
-    ("1e308*10-1e308*10", 10, "not a finite"), ("sqrt(-1)", 10, "domain"), ("(-2)^3", 10, "negative base"),
-    ("pwr(-2,3)", 10, "differs between simulators"), ("2^3^2", 13, "two readings"), ("2^-3^2", 14, "two readings"),
-    ("1<2<3", 13, "two readings"), ("1 ? 2 ? 3 : 4 : 5", 16, "two readings"), ("2*-(3)+4", 12, "two readings"),
-    ("2*-3^2", 12, "two readings"), ("2---3", 12, "two readings"), ("thick > 1 ? -thick : 3", 22, "two readings"),
-    ("max(1, 2, 3)", 10, r"write max\(max\(a, b\), c\)"), ("5mil*1meg", 10, "milli here: write 127u"),
-    ("1 ? 2", 12, "without its ':'"), ("1 : 2", 12, r"without its '\?'"), ("a=1", 11, "a comparison is =="),
-    ("1+2k7", 12, "write 2.7k"), ("v(x)*2", 10, "'v' is not a function"), ("-" * 4 + "1", 13, "signs in a row"),
-    ("(" * 500, 35, "nested deeper"), ("1?" * 26 + "1" + ":1" * 26, 61, "more than 25 '.' in one expression"),
+    *listed("expressions"),
+    ("-" * 4 + "1", 13, "signs in a row"),
+    ("(" * 500, 35, "nested deeper"),
+    ("1?" * 26 + "1" + ":1" * 26, 61, "more than 25 '.' in one expression"),
     ("1?2:1?2:1?2:1?2:(" * 25 + "1" + ")" * 25, 117, "more than 25 '.' in one expression"),
 ])  # fmt: skip
 def test_what_is_not_arithmetic_is_refused_at_its_column(text: str, column: int, message: str) -> None:
@@ -181,3 +158,46 @@ def test_a_greek_mu_is_micro_with_a_warning_as_ngspice_ignores_it() -> None:
     with pytest.warns(fs.FingerspiceWarning, match=r"2:1: 5μ is 5u here and 5 in ngspice 39: write 5u"):
         circuit = fs.parse_netlist("mu\nC1 a 0 5μF\nV1 a 0 1\n.tran 1 1")
     assert circuit["C1"].values["value"] == 5e-6
+
+
+def test_numbers_have_the_value_that_spice_gives_them_and_a_suffix_costs_no_rounding() -> None:
+    assert [[text, parse_number(text)] for text, _ in listed("numbers")] == listed("numbers")
+    assert parse_number("3.5u") == 3.5e-6
+    assert [i for i in range(1000) if parse_number(f"{i}.1u") != float(f"{i}.1e-6")] == []
+
+
+def test_what_is_no_number_or_read_differently_elsewhere_is_refused() -> None:
+    for text, hint in [*listed("no_numbers"), (500 * "9", "characters")]:
+        with pytest.raises(ValueError, match=hint):
+            parse_number(text)
+
+
+def test_a_capital_m_is_suspected_of_meaning_mega_and_a_unit_that_spice_takes_for_a_scale_is_recognised() -> None:
+    assert [t for t in ("1M", "0.2MOhm", "1MΩ", "-3e2M") if not suspicious_mega(t)] == []
+    assert [t for t in ("1m", "0.2meg", "1MEG", "1MIL", "0.2mohm", "M", "x") if suspicious_mega(t)] == []
+    assert suggest_mega("0.2MOhm") == "0.2meg"
+    for text, unit, word, taken in (
+        ("1F", "F", "farad", True), ("1farads", "F", "farad", True), ("0.5N", "N", "newton", True),
+        ("1f", "F", "farad", False), ("1uF", "F", "farad", False),
+    ):  # fmt: skip
+        assert unit_read_as_scale(text, unit, word) is taken
+
+
+def test_engineering_notation_which_without_a_unit_ends_in_the_prefix() -> None:
+    assert [format_si(value, "m") for value, _ in listed("written")] == [text for _, text in listed("written")]
+    assert [format_si(-0.0, "m"), format_si(2e5, ""), format_si(1.0, "")] == ["0 m", "200 k", "1"]
+    assert format_si(123.4, "V", digits=2) == "120 V"
+
+
+@settings(max_examples=cases(100, 40))
+@given(st.floats(min_value=1e-14, max_value=1e14))
+def test_engineering_notation_reads_back_to_its_digits(value: float) -> None:
+    text = format_si(value, "").replace(" ", "").replace("M", "meg")
+    assert parse_number(text) == pytest.approx(value, rel=1e-3)
+
+
+@settings(max_examples=cases(100, 40))
+@given(st.text(max_size=12))
+def test_any_text_is_a_finite_number_or_a_value_error(text: str) -> None:
+    with contextlib.suppress(ValueError):
+        assert math.isfinite(parse_number(text))

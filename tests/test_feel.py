@@ -1,7 +1,5 @@
 """Estimated perception: the skin's mechanics, the thresholds against their sources, levels, and the command line."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -91,17 +89,6 @@ def test_the_level_of_a_sines_friction_is_that_of_the_formula(frozen: fs.Solutio
     mean = MU * LOAD + force
     assert found.change == pytest.approx(2.0 * force / (mean + force), rel=1e-7)
     assert found.change_felt
-
-
-def test_a_level_follows_drive_threshold_and_skin_in_decibels(frozen: fs.Solution) -> None:
-    half = fs.simulate(table1("SIN(0 100 100)"), area="frozen", start="periodic", t_stop=0.01)
-    level = feel(frozen, threshold=FLAT).highest
-    # Force goes with the square of the voltage: 20 log10(4).
-    assert feel(half, threshold=FLAT).highest == pytest.approx(level - 40.0 * math.log10(2.0), abs=1e-6)
-    higher = Threshold("higher", FLAT.frequency, FLAT.level + 6.0)
-    assert feel(frozen, threshold=higher).highest == pytest.approx(level - 6.0, abs=1e-9)
-    stiff = SkinMechanics("stiff", 1e-3, 10.0, 1e4)
-    assert feel(frozen, threshold=FLAT, mechanics=stiff).highest == pytest.approx(level - 20.0, abs=1e-9)
 
 
 def test_what_is_weak_or_too_fast_is_not_felt() -> None:

@@ -1,7 +1,5 @@
 """Any text input is accepted or refused in one sentence; and the fuzzer finds faults that are put in on purpose."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import os

@@ -1,7 +1,5 @@
 """`fs.batch` on a graphics card: its kernel in numba's simulator and compiled for a card, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -107,7 +105,7 @@ def test_what_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         fs.batch(circuit, scenes, device="cuda")
 
 
-@pytest.mark.parametrize(("modes", "pieces"), [(8, 0), (2, 20), (2, 0)][: cases(3, 2)])
+@pytest.mark.parametrize(("modes", "pieces"), [(2, 20), (8, 0), (2, 0)][: cases(3, 1)])
 def test_the_kernel_compiles_for_a_card(modes: int, pieces: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("numba_cuda", reason="numba-cuda is installed on Linux only")
     card.card_compiler.cache_clear()

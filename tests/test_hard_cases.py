@@ -4,8 +4,6 @@ Long runs and tiny signals, too: no drift, no growth of memory, no underflow. Ca
 test_hard_refusals.py. References are independent of the package.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -144,14 +142,6 @@ def test_both_one_sided_values_of_a_jump_are_right(case: str, given: str, law: s
     jumped = solution.u_source[twice + 1] - solution.u_source[twice]
     sizes = [b - a for (t, a), (s, b) in itertools.pairwise(points) if t == s > 0.0]
     np.testing.assert_allclose(jumped, sizes, rtol=1e-13)
-
-
-@every_law
-def test_a_jump_from_rest_divides_as_the_capacitors_do(law: str) -> None:
-    c = np.array([x.c for x in ref.table1_layers(100.0)])
-    solution = run(fs.DC(200.0), law, t_eval=[0.0], t_stop=1e-3)
-    # Layer voltages are parts of 200 V, and rounded as these are.
-    np.testing.assert_allclose(solution.u_layer[0], 200.0 / c / np.sum(1.0 / c), rtol=1e-14, atol=4e-16 * 200.0)
 
 
 # Edges of 1 ns ----------------------------------------------------------------------------------------------

@@ -3,10 +3,7 @@
 Also the failure record of a run, and jumps under `mobile`: a run stays on its branch and never skips a fold.
 """
 
-from __future__ import annotations
-
 import dataclasses
-import json
 import math
 import re
 import warnings
@@ -18,7 +15,6 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 import stress
-from commands import Command
 from fingerspice.results.outcome import Failure
 from hard_cases_reference import StackFold, stack_fold
 from scenes import deck, finger, table1
@@ -171,11 +167,6 @@ def test_nan_at_one_instant_that_is_an_output_is_not_passed_over() -> None:
         fs.simulate(table1(), sources={"Vdrive": source}, t_stop=0.02, t_eval=[1e-3, 3e-3, 0.02])
 
 
-def test_a_loop_of_sources_is_refused_with_the_names_of_all_of_them() -> None:
-    with pytest.raises(fs.InputError, match=r"Vdrive.*Vb|Vb.*Vdrive"):
-        deck(V, "Vb drive mid 5", "Vc mid 0 5", *finger("drive", "0", f=100.0), ".tran 10u 10m uic")
-
-
 STACK = ["Vdrive drive 0 50", *(re.sub(r" r=\S+", "", line) for line in finger("drive", "0", f=100.0))]
 
 
@@ -198,15 +189,6 @@ def test_a_node_reached_by_capacitors_only_has_no_operating_point(lines: list[st
     layers = (dataclasses.replace(coat, r_total=math.inf), dataclasses.replace(gap, r_total=math.inf), skin)
     expected = ref.transient([(0.0, 0.011, 50.0)], solution.t, layers=layers)
     assert np.abs(solution.u_gap - expected.u_gap).max() <= 1e-8 * np.abs(expected.u_gap).max()
-
-
-@pytest.mark.parametrize("area", [0.0, -1e-6, math.nan, math.inf])
-def test_an_area_given_to_a_run_is_a_positive_one(area: float) -> None:
-    with pytest.raises(fs.InputError, match=r"area is .* m\^2; allowed: a positive area"):
-        fs.simulate(table1(), area=area)
-
-
-# The failure record ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("beside", ["", "Rload drive 0 1meg"], ids=["stack", "network"])
@@ -253,23 +235,6 @@ def test_an_error_that_cannot_be_met_is_put_in_figures() -> None:
     assert failure.action == "ask for a larger rtol"
 
 
-def test_the_command_line_tells_the_same_in_words_and_in_json(command: Command) -> None:
-    words = ["run", "pad.cir", "--charge-law", "mobile", "--set", "Xgap.d=10n", "--no-plot"]
-    plain = command(*words)
-    assert plain.code == 1
-    assert "last steps tried:" in plain.out
-    failure = json.loads(command(*words, "--json").out)["failure"]
-    assert failure["status"] == "FOLD"
-    assert failure["element"] == "Xgap"
-    assert set(failure) == {
-        *("status", "cause", "action", "t", "step", "element", "u_gap", "area", "fold_margin", "tried")
-    }
-    assert set(failure["tried"][0]) == {"t", "step", "error"}
-    compared = command("compare", *words[1:], "--json")
-    assert compared.code == 1
-    assert json.loads(compared.out)["failure"]["status"] == "FOLD"
-
-
 def test_a_run_near_its_fold_warns_and_says_how_near() -> None:
     circuit = table1().replace({"Vdrive": fs.Sine(50.0, 100.0), "Xgap.d": 1e-7})
     with pytest.warns(fs.FingerspiceWarning, match="fold of the mobile charge law is near"):
@@ -307,9 +272,6 @@ def test_a_fold_soon_after_a_jump_at_the_start_is_met() -> None:
     times = [run.failure.t for run in runs if run.failure is not None]
     assert times == sorted(times, reverse=True)
     assert times
-
-
-# Jumps under `mobile` ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")

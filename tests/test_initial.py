@@ -1,16 +1,12 @@
 """Start of a run: IC=, .ic and the operating point, against ngspice 39, closed forms and conservation of charge."""
 
-from __future__ import annotations
-
-import re
-
 import numpy as np
 import pytest
 
 import analytic
 import fingerspice as fs
 from ngspice_tools import CIRCUITS, run_ngspice
-from scenes import LAWS, cases, deck, every_law, finger, table1
+from scenes import LAWS, cases, deck, every_law, finger, listed, table1
 from start_reference import deck_of, random_network
 
 pytestmark = pytest.mark.filterwarnings("ignore:.* has no effect here")
@@ -70,9 +66,6 @@ def apart(circuit: fs.Circuit, law: str | None = None, text: str | None = None, 
     return worst
 
 
-# Random networks ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(cases(140, 40)))
 def test_random_networks_start_and_go_on_as_their_charge_says(seed: int) -> None:
     network = random_network(seed)
@@ -104,27 +97,6 @@ def test_random_networks_with_a_finger_start_as_in_ngspice(seed: int) -> None:
         initial.append(f".ic v(area)={round(float(rng.uniform(20.0, 40.0)), 2)!r}")
     text = deck_of(random_network(seed), STEP, STOP, (*finger("n1", "n2", **gap), *initial))
     assert apart(fs.parse_netlist(text), LAWS[seed % 2], max_step=STEP) <= 1.01e-3
-
-
-# IC= of several capacitors ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_the_order_of_capacitors_does_not_matter_and_charge_is_conserved(turned: bool) -> None:
-    capacitors = ["C2 b 0 100p", "C1 b 0 1n IC=50"]
-    circuit = deck("V1 a 0 0", "R1 a b 10k", *capacitors[:: -1 if turned else 1], ".tran 1n 100n uic")
-    s = fs.simulate(circuit)
-    expected = 50.0 / 1.1 * np.exp(-s.t / 11e-6)
-    assert np.abs(s.node_voltages["b"] - expected).max() <= 1e-12 * 50.0
-
-
-def test_a_capacitor_with_ic_beside_others_that_ic_lines_give() -> None:
-    circuit = deck("V1 a 0 10", "R1 a b 10k", "C2 b 0 100p", "C1 b c 1n IC=50", "C3 c 0 1n", "R3 c 0 1meg",
-                   ".ic v(b)=20 v(c)=5", ".tran 1n 100n uic")  # fmt: skip
-    v = start(circuit)
-    # Charge of nodes b and c: 100 pF at 20 V, 1 nF at IC=, 1 nF at 5 V.
-    b, c = np.linalg.solve([[1.1, -1.0], [-1.0, 2.0]], [0.1 * 20.0 + 50.0, 5.0 - 50.0])
-    assert [v["b"], v["c"]] == pytest.approx([b, c], rel=1e-13)
 
 
 @every_law
@@ -184,26 +156,9 @@ def test_ic_of_capacitors_counts_with_uic_only() -> None:
     assert circuit.unused == ("IC= of C1",)
 
 
-# The operating point with .ic held ---------------------------------------------------------------------------
-
-
-def test_nodes_that_ic_does_not_name_are_at_rest() -> None:
-    circuit = deck("V1 a 0 10", "R1 a b 1k", "R2 b 0 1k", "C1 b 0 1n", "R3 a c 1k", "C2 c 0 1n", "R4 c d 1k",
-                   "R5 d 0 2k", "C3 d 0 1n", ".ic v(c)=3", ".tran 1n 10n")  # fmt: skip
-    assert start(circuit) == pytest.approx({"a": 10.0, "b": 5.0, "c": 3.0, "d": 2.0}, rel=1e-13)
-
-
-def test_a_voltage_source_is_stronger_than_ic_and_tied_nodes_take_the_mean() -> None:
-    circuit = deck("V1 a 0 10", "V2 a b 4", "C1 b 0 1n", "R3 b 0 1meg", "Vf c d 4", "Cc c 0 1n", "Rd d 0 1k",
-                   ".ic v(b)=3 v(c)=7 v(d)=5", ".tran 1n 10n")  # fmt: skip
-    assert start(circuit) == pytest.approx({"a": 10.0, "b": 6.0, "c": 8.0, "d": 4.0}, rel=1e-13)
-
-
-def test_a_node_that_only_capacitors_reach_starts_where_ic_says() -> None:
-    lines = ("V1 a 0 10", "C1 a b 1n", "C2 b 0 2n")
-    with pytest.raises(fs.InputError, match="C1 and C2 leave nodes that are reached by capacitors only"):
-        fs.simulate(deck(*lines, ".tran 1n 10n"))
-    assert start(deck(*lines, ".ic v(b)=7", ".tran 1n 10n"))["b"] == pytest.approx(7.0, rel=1e-13)
+@pytest.mark.parametrize(("lines", "expected"), [case for _, *case in listed("held")])
+def test_an_operating_point_with_ic(lines: str, expected: dict[str, float]) -> None:
+    assert start(deck(*lines.split("|"), ".tran 1n 10n")) == pytest.approx(expected, rel=1e-13)
 
 
 @every_law
@@ -236,9 +191,6 @@ def test_the_difference_of_two_nodes_is_node_p_minus_node_n() -> None:
     whole = coat + gap + skin
     assert v["skin"] == pytest.approx(10.0 - 50.0 * skin / whole, rel=1e-10)
     assert v["top"] == pytest.approx(30.0 - 50.0 * (skin + gap) / whole, rel=1e-10)
-
-
-# Areas with dynamics of their own ----------------------------------------------------------------------------
 
 
 @every_law
@@ -285,38 +237,15 @@ def test_start_values_without_effect_are_listed() -> None:
     assert table1(extra=".ic v(area)=34", tran="10u 10m").unused == ()
 
 
-# Exports ------------------------------------------------------------------------------------------------------
-
-
-EXPORTED = [
-    ("amplifier", (), "v(top)=30 v(skin)=-5 v(drive)=40"),
-    ("amplifier", (SLOW,), "v(top)=30"),
-    ("amplifier", DC_AMPLIFIER, "v(top)=30"),
-    ("amplifier", DC_AMPLIFIER, "v(area)=20 v(top)=10"),
-    ("amplifier", (*DC_AMPLIFIER, SLOW), "v(amp)=3"),
-    ("fingerpad_5khz", (), "v(top)=30 v(skin)=10"),
-    ("fingerpad_5khz", (), "v(drive)=50 v(top)=-130 v(skin)=10"),
-    ("fingerpad_5khz", (("SIN(0 200 5k)", "DC 150"),), "v(drive)=50 v(top)=30 v(skin)=-60"),
-    ("fingerpad_5khz", (("SIN(0 200 5k)", "SIN(26 100 5k)"), ("1m uic", "1m")), "v(area)=20 v(top)=30"),
-    ("fingerpad_dispersive", (("30m uic", "3m uic"),), "v(top)=30 v(skin)=10"),
-    ("fingerpad_dispersive", (("30m uic", "3m"), ("SIN(0 120 100)", "SIN(50 120 100)")), "v(top)=30"),
-    ("two_fingers", (SLOW, ("0.5u 1m", "20n 40u")), "v(xlight.top)=30 v(xlight.skin)=5 v(body)=-10 v(firm)=20"),
-]
-
-
 # The laws in turn: each deck is run under both.
-@pytest.mark.parametrize("case", range(cases(2, 1) * len(EXPORTED)))
+@pytest.mark.parametrize("case", range(cases(2, 1) * len(listed("starts"))))
 @pytest.mark.filterwarnings("ignore:of the source's energy")
 def test_an_export_starts_where_the_deck_does(case: int) -> None:
-    name, changes, initial = EXPORTED[case % len(EXPORTED)]
+    exported = listed("starts")
+    name, changes, initial = exported[case % len(exported)]
     circuit = shipped(name, *changes, extra=f".ic {initial}")
-    for law in LAWS if name == "two_fingers" else (LAWS[(case + case // len(EXPORTED)) % 2],):
+    for law in LAWS if name == "two_fingers" else (LAWS[(case + case // len(exported)) % 2],):
         assert apart(circuit, law) <= 1.2e-4
-
-
-def test_ic_of_capacitors_goes_along() -> None:
-    text = fs.export_netlist(shipped("amplifier", ("150p", "150p IC=100")))
-    assert re.search(r"^Ccable drive 0 1\.5e-10 IC=100\.0$", text, re.MULTILINE)
 
 
 def test_the_other_reading_of_eq_7_starts_the_same_there() -> None:

@@ -1,7 +1,5 @@
 """The inverse drive: its source voltage produces the wanted force, and impossible requests get a clear message."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -15,7 +13,7 @@ from scipy.optimize import minimize
 import analytic as ref
 import fingerspice as fs
 from commands import Command
-from scenes import cases, dispersive_deck, shipped, table1
+from scenes import cases, dispersive_deck, listed, shipped, table1
 
 KINDS = {
     "stack": table1(), "dispersive": fs.parse_netlist(dispersive_deck()),
@@ -64,14 +62,6 @@ def test_a_drive_of_a_thousand_volts_is_warned_about() -> None:
         warnings.simplefilter("error", fs.FingerspiceWarning)
         fs.inverse_drive(leaky, force=wanted, rate=48e3, limit=300.0)
         fs.inverse_drive(table1(), force=wanted, rate=48e3)
-
-
-def test_a_run_of_its_own_finds_the_same_force() -> None:
-    found = fs.inverse_drive(table1(), force=fs.Sum((fs.DC(0.2), fs.Sine(0.1, 60.0))), duration=0.02)
-    t = np.linspace(0.0, 0.02, 301)
-    run = fs.simulate(found.circuit, t_stop=0.02, t_eval=t, rtol=1e-9)
-    # Between the samples too, where right after the start the layers' fast part shows (8e-5).
-    np.testing.assert_allclose(run.f_el, 0.2 + 0.1 * np.sin(2 * np.pi * 60.0 * t), rtol=0.0, atol=1e-4 * 0.3)
 
 
 def test_the_independent_transient_makes_the_wanted_force() -> None:
@@ -126,17 +116,10 @@ def test_no_other_drive_within_the_limit_does_much_better() -> None:
 
 
 BAD = [
-    ({"friction": [0.2, math.nan, 0.2]}, "friction: row 1 is nan"),
-    ({"friction": [0.2, 0.1, 0.2]}, "friction: 0.1 N at 0.001 s is reached by no voltage"),
-    ({"force": [0.2, -0.1]}, "force: -0.1 N at 0.001 s is reached by no voltage"),
+    *listed("drives"),
     ({"force": [0.2, 0.1], "rate": None}, "force is an array without a rate"),
-    ({"force": [0.1, 0.2], "friction": [0.2, 0.3]}, "both is given"),
-    ({}, "neither is given"),
     ({"force": fs.Sine(0.1, 60.0)}, "duration="),
     ({"force": [0.1] * 100, "carrier": 100.0}, "too fast for a rate of 1000 Hz"),
-    ({"force": [0.1] * 3, "limit": -5.0}, "limit is -5"),
-    ({"force": [1e9] * 3}, "reached by no voltage"),
-    ({"force": [0.1] * 3, "charge_law": "no"}, "charge_law is 'no'"),
     *(({"circuit": shipped(deck), "force": [0.1, 0.1]}, said) for deck, said in (
         ("two_fingers", "one finger"), ("current_drive", "one V"), ("fingerpad_dispersive", "one V"))),
     ({"circuit": table1(gap={"tau": 1e-3}), "force": [0.1, 0.1]}, "tau"),
@@ -188,21 +171,7 @@ def test_design_writes_drive_prediction_and_picture(command: Command) -> None:
     assert command("run", "pad.cir", "--source", drive, "--stop", "5m", "--no-plot", "--out", "again").code == 0
 
 
-@pytest.mark.parametrize(
-    ("rows", "words", "said"),
-    [
-        ("0, 0.2\n0.1, 0.2\n", [], "no header"),
-        ("time; friction\n0; 0.2\n1; 0.2\n", [], "semicolons"),
-        ("time friction\n0 0,2\n1 0,2\n", [], "decimal comma"),
-        ("time,friction\n0,0.2\n1,nan\n", [], "line 3: column 'friction' is nan"),
-        ("time,friction\n1,0.2\n0,0.2\n", [], "line 3: the time 0 s follows 1 s"),
-        ("time,volts\n1,0.2\n2,0.2\n", [], "no column named force or friction"),
-        ("time,friction (V)\n1,0.2\n2,0.2\n", [], "the unit of column 'friction' is 'V'"),
-        ("time,friction\n0,0.2\n0.1,0.2\n0.2,0.2\n", ["--rate", "1k"], "its times are at 10 Hz"),
-        ("friction\n0.2\n0.2\n", [], "no column of times and no rate"),
-        ("time,friction\n0,0.1\n0.1,0.2\n", [], "reached by no voltage"),
-    ],
-)
+@pytest.mark.parametrize(("rows", "words", "said"), listed("wanted"))
 def test_bad_tables_are_refused_in_one_sentence(command: Command, rows: str, words: list[str], said: str) -> None:
     Path("wanted.csv").write_text(rows)
     result = command("design", "wanted.csv", "pad.cir", *words)

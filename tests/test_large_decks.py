@@ -3,8 +3,6 @@
 Nothing is timed: at these sizes an algorithm of quadratic cost would not finish.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -86,9 +84,7 @@ TOO_MANY = {
 
 
 @pytest.mark.parametrize("name", TOO_MANY)
-def test_more_words_and_lines_than_a_netlist_may_hold_are_refused_before_they_are_kept(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_words_and_lines_than_a_netlist_may_hold_are_refused_before_they_are_kept(name, monkeypatch):
     head, part, count, tail, said = TOO_MANY[name]
     smaller = cases(1, 1 if name == "words" or "lines" in name else 10)
     monkeypatch.setattr(reader, "MAX_WORDS", reader.MAX_WORDS // smaller)

@@ -1,6 +1,4 @@
-"""Closed-form response of linear modes, against closed forms and quadrature at 30 to 600 digits and expm."""
-
-from __future__ import annotations
+"""Linear modes in closed form, and tables of exponential steps, against quadrature and integrals in many digits."""
 
 import itertools
 from functools import cache
@@ -10,9 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import expm
+from numpy.polynomial import chebyshev
 
+from fingerspice.numerics import lobatto
 from fingerspice.numerics.linear import respond
+from fingerspice.numerics.lobatto import BETWEEN, FIRST, MISS, NODES, POINTS, ROWS, SECOND, TO_SERIES
+from fingerspice.solve.problem import ROUNDING
 
 NO_SERIES = np.zeros((1, 0))
 
@@ -78,23 +79,6 @@ def error(rows, expected):
     return np.abs(rows[:, 0] - np.real(expected)).max() / np.abs(expected).max()
 
 
-RATES = [0.0, 1e-3, 1.0, 40.0, 1e6, 1e15]
-STEADY = [(0.0, 0.0), (0.0, 30.0), (0.0, 1e-6), (0.0, 1e5)]
-DAMPED = [(-3.0, 0.0), (-40.0, 7.0), (-1e9, 0.0), (2.0, 500.0), (20.0, 0.0)]
-
-
-@pytest.mark.parametrize("p", range(5))
-@pytest.mark.parametrize("wave", STEADY + DAMPED)
-def test_every_kind_of_term_from_rest(p, wave):
-    rng = np.random.default_rng(p)
-    row = term(3.0, p, *wave, phi=0.7)
-    for rate in RATES:
-        t = times(1.3, rate, rng)
-        rows, w_end = one_segment([rate], [row], 1.3, t)
-        assert error(rows, [exact_term(rate, row, x) for x in t]) <= 1e-14
-        assert w_end[0] == rows[-1, 0]
-
-
 @pytest.mark.parametrize("off", [0.0, 1e-15, 1e-12, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 3.0])
 @pytest.mark.parametrize("p", [0, 1, 4])
 def test_a_wave_that_decays_as_the_mode_does(p, off):
@@ -135,16 +119,6 @@ def test_any_rates_terms_and_lengths(rates, rows, decades):
     assert np.array_equal(w_end, got[-1])
 
 
-def test_a_frequency_of_a_billion_radians_keeps_its_phase():
-    start, omega, rate = 1e-3, 2.0 * np.pi * 5000.0, 800.0
-    t = np.array([0.7, 1999.987654321, 2e4, 31830.9])
-    rows, _ = respond([rate], [1.0], [start, 4e4], [[term(1.0, 0, 0.0, omega, 0.2)]], NO_SERIES, [0.0], t)
-    with mp.workdps(40):
-        tau = [mp.mpf(x) - mp.mpf(start) for x in t]
-    expected = np.array([exact_term(rate, term(1.0, 0, 0.0, omega, 0.2), x) for x in tau])
-    assert np.abs(rows[:, 0] - expected.real).max() <= 1e-15 / omega
-
-
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 20, 33])
 def test_a_chebyshev_series_at_any_rate(count):
     rng = np.random.default_rng(count)
@@ -156,31 +130,6 @@ def test_a_chebyshev_series_at_any_rate(count):
         t = times(length, rate, rng)
         rows, _ = respond([rate], [1.0], [0.0, length], [[term(0.0)]], [c], [0.0], t)
         assert error(rows, [exact_series(rate, c, length, x) for x in t]) <= 3e-14
-
-
-def test_a_chain_of_segments_equals_the_matrix_exponential():
-    rates, gains = np.array([0.0, 0.0, 2.0, 2.0, 2.0 + 1e-12, 900.0]), np.array([1.0, -2.0, 3.0, 1.0, 1.0, 900.0])
-    edges = np.array([0.5, 0.6, 1.6, 1.601, 3.0])
-    rng = np.random.default_rng(0)
-    n, omega, a = rates.size, 11.0, -0.8
-    terms = np.array([[term(c[0]), term(c[1], 1), term(c[2], 0, a, omega, 0.3)] for c in rng.standard_normal((4, 3))])
-    w0 = rng.standard_normal(n)
-    t = np.sort(np.concatenate([edges, rng.uniform(0.5, 3.0, 20)]))
-    rows, w_end = respond(rates, gains, edges, terms, np.zeros((4, 0)), w0, t)
-    # The input is the output of 4 more states: 1, tau, and the two of a decaying wave.
-    full = np.zeros((n + 4, n + 4))
-    full[:n, :n] = -np.diag(rates)
-    full[n + 1, n] = 1.0
-    full[n + 2 :, n + 2 :] = [[a, -omega], [omega, a]]
-    w, expected = w0, []
-    for s in range(4):
-        full[:n, n:] = np.outer(gains, [*terms[s, :, 0], 0.0])
-        y = np.concatenate([w, [1.0, 0.0, np.cos(0.3), np.sin(0.3)]])
-        here = t[(t >= edges[s]) & ((t < edges[s + 1]) | (s == 3))]
-        expected += [(expm(full * (x - edges[s])) @ y)[:n] for x in here]
-        w = (expm(full * (edges[s + 1] - edges[s])) @ y)[:n]
-    assert np.all(np.abs(rows - expected) <= 1e-12 * np.abs(expected).max(axis=0))
-    assert np.all(np.abs(w_end - w) <= 1e-12 * np.abs(expected).max(axis=0))
 
 
 def test_a_hundred_thousand_segments_add_up_no_rounding():
@@ -208,3 +157,96 @@ def test_decayed_states_are_zero_and_never_denormal():
         assert np.all(rows[t >= 2.5] == 0.0)
         assert w_end[0] == 0.0
         assert not np.any((rows != 0.0) & (np.abs(rows) < 2.3e-308))
+
+
+DIGITS = 60
+# From no decay in a step to one that is over within a rounding of its start, past every change of branch.
+Z = (0.0, 1e-12, 1e-3, 0.1, 1.0, 5.0, 20.0, 44.0, 46.0, 100.0, 689.0, 691.0, 1e4, 1e8, 1e12)
+
+
+@cache
+def moments(z: float, c: float) -> list[mp.mpf]:
+    """Integrals over [0, c] of exp(-z (c - s)) s^degree ds, by degree from 0 to NODES."""
+    with mp.workdps(2 * DIGITS):
+        z, c = mp.mpf(z), mp.mpf(c)
+        if z * c >= 1:
+            total = [(1 - mp.exp(-z * c)) / z]
+            for d in range(1, NODES + 1):
+                total.append((c**d - d * total[-1]) / z)
+            return total
+        # sum of (-z)^k c^(degree + 1 + k) / ((degree + 1) ... (degree + 1 + k)), from the highest degree down
+        term = total = c ** (NODES + 1) / (NODES + 1)
+        k = NODES + 1
+        while abs(term) > abs(total) * mp.mpf(10) ** -(2 * DIGITS):
+            k += 1
+            term *= -z * c / k
+            total += term
+        out = [total]
+        for d in range(NODES, 0, -1):
+            out.append((c**d - z * out[-1]) / d)
+        return out[::-1]
+
+
+def product(zeros: np.ndarray) -> list[mp.mpf]:
+    """Coefficients, ascending, of the product of (s - c) over these c."""
+    out = [mp.mpf(1)]
+    for c in zeros:
+        out = [a - mp.mpf(float(c)) * b for a, b in zip([mp.mpf(0), *out], [*out, mp.mpf(0)], strict=True)]
+    return out
+
+
+def value(coefficients: list[mp.mpf], x: float) -> mp.mpf:
+    """Of a polynomial with ascending coefficients."""
+    return mp.polyval(coefficients[::-1], mp.mpf(float(x)))
+
+
+def test_the_nodes_are_those_of_gauss_and_lobatto_and_symmetric() -> None:
+    with mp.workdps(40):
+        inner = mp.polyroots(mp.taylor(lambda x: mp.diff(lambda y: mp.legendre(NODES - 1, y), x), 0, NODES - 2)[::-1])
+        exact = sorted([mp.mpf(0), mp.mpf(1), *((1 + mp.re(x)) / 2 for x in inner)])
+        worst = max(abs(mp.mpf(float(a)) - b) for a, b in zip(POINTS[:NODES], exact, strict=True))
+    assert worst <= 1e-15
+    np.testing.assert_allclose(POINTS[:NODES] + POINTS[NODES - 1 :: -1], 1.0, rtol=0, atol=2e-16)
+
+
+@pytest.mark.parametrize("z", Z)
+def test_tables_are_decays_and_integrals_of_the_polynomials_through_the_nodes(z: float) -> None:
+    decay, phi, miss = np.full(ROWS, np.nan), np.full((NODES, ROWS), np.nan), np.full(ROWS, np.nan)
+    lobatto.fill_table(z, decay, phi, miss)
+    # Error over the largest entry that is none: with decay, the engine's own floor.
+    rounding = 1e-15 if z <= 1.0 else ROUNDING
+    with mp.workdps(DIGITS):
+        for i, c in enumerate(POINTS):
+            # The product z c is rounded, by half a unit in its last place; and there are no denormals.
+            exact = float(mp.exp(-mp.mpf(z) * mp.mpf(float(c))))
+            assert decay[i] == pytest.approx(exact, rel=3e-16 * (1.0 + z * c), abs=1e-299)
+            assert decay[i] == 0.0 or decay[i] > 1e-300
+        polynomials = [product(np.delete(POINTS[:NODES], j)) for j in range(NODES)]
+        # Each is 1 at its node; the last is zero at all, and of size 1 at the second point between them.
+        scales = [value(one, node) for one, node in zip(polynomials, POINTS, strict=False)]
+        polynomials.append(product(POINTS[:NODES]))
+        scales.append(abs(value(polynomials[-1], POINTS[SECOND])))
+        for row, one, scale in zip([*phi, miss], polynomials, scales, strict=True):
+            for i, c in enumerate(POINTS):
+                exact = mp.fdot(one, moments(z, c)[: len(one)]) / scale
+                assert abs(mp.mpf(float(row[i])) - exact) <= rounding * float(moments(z, c)[0])
+
+
+def test_the_points_between_see_what_the_nodes_miss_in_the_ratio_of_miss() -> None:
+    # x^13 is missed by the node polynomial times the scale of its highest coefficient, and nothing else.
+    x = 2.0 * POINTS - 1.0
+    missed = chebyshev.chebval(x, np.eye(NODES + 1)[NODES])
+    seen = missed[FIRST:] - missed[:NODES] @ BETWEEN
+    np.testing.assert_allclose(seen / MISS, seen[0] / MISS[0], rtol=1e-12)
+    assert abs(MISS[1]) == np.abs(MISS).max() == pytest.approx(1.0, rel=1e-14)
+    # The next few orders have zeros elsewhere: no mixture of three of them is small at all points.
+    higher = chebyshev.chebval(x, np.eye(NODES + 3)[NODES:].T)
+    seen = higher[:, FIRST:] - higher[:, :NODES] @ BETWEEN
+    assert np.linalg.svd(seen, compute_uv=False).min() > 0.1
+
+
+def test_values_between_nodes_and_series_are_exact_up_to_the_nodes_degree() -> None:
+    values = chebyshev.chebval(2.0 * POINTS - 1.0, np.eye(NODES))
+    np.testing.assert_allclose(values[:, :NODES] @ BETWEEN, values[:, FIRST:], rtol=0, atol=2e-15)
+    # The last columns fill a vector.
+    np.testing.assert_allclose(values[:, :NODES] @ TO_SERIES, np.eye(*TO_SERIES.shape), rtol=0, atol=5e-15)

@@ -1,13 +1,17 @@
-"""Stratum corneum: Eqs. 18 and 19, and the reason for reading the damaged Eq. 18 as a cubic."""
+"""Stratum corneum by Eqs. 18 and 19 with the reason for reading Eq. 18 as a cubic, and tables of measured materials."""
 
-from __future__ import annotations
+import warnings
+from pathlib import Path
 
 import mpmath as mp
 import numpy as np
 import pytest
 from scipy.optimize import nnls
 
+import fingerspice as fs
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
+from fingerspice.studies.fit.materialfit import read_table
+from scenes import cases, listed
 
 CUBIC, PRINTED, QUARTIC = (3, 2, 1), (3, 3, 2), (4, 3, 2)
 F = np.logspace(1.0, 5.0, 81)
@@ -49,19 +53,6 @@ def test_equations_18_and_19_have_the_values_of_forty_digit_arithmetic(z: str) -
     assert float(skin_permittivity(10.0 ** float(z))) == pytest.approx(eps, rel=1e-13)
 
 
-def test_the_skin_at_100_hz_and_10_khz_has_the_numbers_worked_out_by_hand() -> None:
-    # z = 2: -0.184 + 0.318 - 0.4266 + 4.9229 = 4.6303; z = 4: -1.472 + 1.272 - 0.8532 + 4.9229 = 3.8697
-    np.testing.assert_allclose(skin_resistivity([100.0, 1e4]), [10**4.6303, 10**3.8697], rtol=1e-12)
-    # z = 2: -0.09152 + 0.57024 - 1.2628 + 1.35852 - 1.247 + 4.1598 = 3.48724
-    assert float(skin_permittivity(100.0)) == pytest.approx(10**3.48724, rel=1e-12)
-
-
-def test_values_keep_the_shape_of_the_frequencies() -> None:
-    assert EPS0 == 8.854e-12, "as printed in Table 1"
-    for shape in ((), (3,), (2, 3)):
-        assert skin_resistivity(np.full(shape, 50.0)).shape == skin_permittivity(np.full(shape, 50.0)).shape == shape
-
-
 def test_resistivity_and_permittivity_fall_over_the_measured_band() -> None:
     f = np.logspace(*np.log10(SKIN_BAND), 200)
     assert np.all(np.diff(skin_resistivity(f)) < 0.0)
@@ -83,3 +74,118 @@ def test_of_all_exponents_up_to_four_the_cubic_agrees_best_with_the_permittivity
     best = sorted(misfit, key=misfit.__getitem__)
     assert best[0] == CUBIC
     assert misfit[best[1]] > 1.5 * misfit[CUBIC]
+
+
+TABLE_F = np.geomspace(*SKIN_BAND, 41)
+RHO, EPS = skin_resistivity(TABLE_F), skin_permittivity(TABLE_F)
+TABLE = np.column_stack([TABLE_F, RHO, EPS])
+
+
+def written(path: Path, head: str, columns: tuple[np.ndarray, ...], mark: str = ",") -> Path:
+    """A file of columns with a line of names."""
+    rows = "\n".join(mark.join(f"{x:.17g}" for x in row) for row in zip(*columns, strict=True))
+    path.write_text(f"{head}\n{rows.replace('.', ',') if mark == ';' else rows}\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("head", "columns"),
+    [
+        ("f,rho,eps_r", (TABLE_F, RHO, EPS)),
+        ("frequency [Hz],resistivity [ohm m],relative permittivity [1]", (TABLE_F, RHO, EPS)),
+        ("f (kHz),rho (ohm cm),eps'", (TABLE_F / 1e3, RHO * 100.0, EPS)),
+        ("f_MHz,rho/kΩm,eps_r", (TABLE_F / 1e6, RHO / 1e3, EPS)),
+        ("omega [rad/s],rho,eps_r", (2.0 * np.pi * TABLE_F, RHO, EPS)),
+        ("f [rad/s],rho,eps_r", (2.0 * np.pi * TABLE_F, RHO, EPS)),
+        ("f,sigma [mS/m],eps_r", (TABLE_F, 1e3 / RHO, EPS)),
+        ("f,conductivity / uS/cm,eps_r", (TABLE_F, 1e4 / RHO, EPS)),
+        ("eps_r,f,rho", (EPS, TABLE_F, RHO)),
+        ("sigma [S/m],eps [F/m],frequency [Hz]", (1.0 / RHO, EPS * EPS0, TABLE_F)),
+        ("first,second,third", (TABLE_F, RHO, EPS)),
+        ("eps_r,one,two", (EPS, TABLE_F, RHO)),
+    ],
+)
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_a_header_says_what_the_columns_are(tmp_path, head, columns, mark):
+    path = written(tmp_path / "skin.csv", head.replace(",", mark), columns, mark)
+    np.testing.assert_allclose(read_table(path), TABLE, rtol=1e-12)
+
+
+ROWS = "\n1,2,3\n2,2,3\n3,2,3\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [*listed("materials"), ('"' + "1" * 140_000, "field larger than field limit")]
+)
+def test_files_that_are_no_material_are_refused(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(fs.InputError, match=said):
+        fs.fit_material(path)
+
+
+@pytest.mark.parametrize(("order", "power", "factors", "named"), listed("material_slips"))
+def test_the_likely_slip_is_named(order: list[int], power: int, factors: list[float], named: str) -> None:
+    # A slip of a factor of 6 is a fifth off a material, one of 1000 is none.
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            fs.fit_material((TABLE ** [1, power, 1] * factors)[:, order])
+            said = str(caught[0].message)
+        except fs.InputError as error:
+            said = str(error)
+    assert "% (rms) from any causal and passive material (Kramers-Kronig); likely " in said
+    assert named in said
+
+
+def test_data_that_are_no_material_for_no_known_reason_are_warned_about_then_refused() -> None:
+    rough = np.random.default_rng(2).normal(size=(TABLE_F.size, 2))
+    some, much = (TABLE * np.column_stack([np.ones(TABLE_F.size), np.exp(x * rough)]) for x in (0.25, 1.0))
+    with pytest.warns(fs.FingerspiceWarning, match=r"the data are .* % .rms. from any causal .*Kramers-Kronig.$"):
+        fit = fs.fit_material(some)
+    assert 0.1 < fit.kramers_kronig.rms < fit.rms < 0.3
+    with pytest.raises(fs.InputError, match=r"passive material \(Kramers-Kronig\); allowed: at most"):
+        fs.fit_material(much)
+
+
+def test_a_drift_too_small_for_a_refusal_is_told_from_noise() -> None:
+    material = fs.ColeCole(10.0, ((1e4, 1e-3, 0.1), (100.0, 1e-6, 0.2)), 1e-4)
+    y = material.admittivity(TABLE_F)
+    true = np.column_stack([TABLE_F, 1.0 / y.real, y.imag / (2.0 * np.pi * TABLE_F * EPS0)])
+    drift = true * np.column_stack([np.ones(TABLE_F.size), np.geomspace(1.0, 1.3, TABLE_F.size), np.ones(TABLE_F.size)])
+    with pytest.warns(fs.FingerspiceWarning, match=r"the data are 4.4 % \(rms\) from .* along a smooth course, as of"):
+        found = fs.fit_material(drift).kramers_kronig
+    assert 0.03 < found.rms < 0.1
+    assert found.systematic > 0.5
+    # As large a misfit by noise is no cause for a warning; several draws, as one may pass by chance.
+    for seed in range(cases(10, 4)):
+        rough = np.exp(0.05 * np.random.default_rng(seed).normal(size=(TABLE_F.size, 2)))
+        noisy = fs.fit_material(true * np.column_stack([np.ones(TABLE_F.size), rough])).kramers_kronig
+        assert noisy.rms > 0.03
+        assert noisy.systematic < 0.5
+
+
+def test_too_few_poles_are_warned_about_then_refused() -> None:
+    broad = fs.ColeCole(5.0, ((1000.0, 1e-3, 0.2), (60.0, 3e-6, 0.1)), 2e-5)
+    with pytest.warns(fs.FingerspiceWarning, match="the ladder misses the data by .* % rms; more poles would come"):
+        assert 0.1 < fs.fit_material(broad, poles=1).rms < 0.3
+    steep = fs.ColeCole(3.0, ((1e6, 1e-2, 0.0), (1e4, 1e-4, 0.0), (100.0, 1e-6, 0.0)), 1e-7, (1.0, 1e7))
+    with pytest.raises(fs.InputError, match=r"the ladder misses the data by .* % rms; allowed: at most 30 %, so more"):
+        fs.fit_material(steep, poles=1)
+
+
+def test_a_fit_draws_itself_and_gives_the_lines_for_a_deck(tmp_path: Path) -> None:
+    fit = fs.fit_material(TABLE)
+    given = TABLE, TABLE[::-1], written(tmp_path / "skin.csv", "f,rho,eps_r", (TABLE_F, RHO, EPS))
+    assert len({fs.fit_material(one, poles=4).ladder for one in given}) == 1
+    axes = fit.plot().axes
+    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), RHO, rtol=1e-12)
+    np.testing.assert_allclose(axes[1].lines[0].get_ydata(), EPS, rtol=1e-12)
+    assert np.asarray(axes[2].lines[0].get_ydata()).max() == pytest.approx(100.0 * fit.largest)
+    # As the docstring has it.
+    (tmp_path / "myskin.lib").write_text(fit.to_netlist("MYSKIN"))
+    deck = (Path(__file__).parents[1] / "circuits" / "fingerpad_dispersive.cir").read_text()
+    lines = deck.replace("SKIN_DISPERSIVE", "MYSKIN").splitlines()
+    (tmp_path / "deck.cir").write_text("\n".join([lines[0], ".include myskin.lib", *lines[1:]]))
+    circuit = fs.read_netlist(tmp_path / "deck.cir")
+    assert len(circuit.by_device("SLAB")) == len(fit.ladder.poles) + 1

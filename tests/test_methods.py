@@ -1,7 +1,5 @@
 """Every method on every circuit: the package's own steppers, and scipy's and torchdiffeq's on one right-hand side."""
 
-from __future__ import annotations
-
 import re
 from functools import lru_cache
 
@@ -74,15 +72,6 @@ def test_requests_that_cannot_be_run_are_refused_with_what_is_allowed(circuit, h
         fs.simulate(circuit, **how)
 
 
-@pytest.mark.parametrize("rtol", [1e-3, 1e-8, 1e-12])
-@pytest.mark.parametrize("r_coat", ["1", "0.2meg", "1e15"])
-def test_the_automatic_method_of_a_coupled_scene_is_exponential_however_stiff(rtol, r_coat):
-    solution = fs.simulate(table1(coat={"r": r_coat}), rtol=rtol, t_stop=1e-3)
-    assert solution.method == "exponential"
-    assert solution.plan.tier == "coupled"
-    assert solution.plan.stiff == (r_coat == "1")
-
-
 # With two sources, with an area that has dynamics of its own, and with two areas that follow.
 NETWORKS = {
     "amplifier": (shipped("amplifier"), 1e-4),
@@ -149,18 +138,6 @@ def test_a_run_goes_on_from_one_by_another_method(first, law):
                 assert np.abs(ours - theirs).max() <= 1e-7 * np.abs(getattr(whole, name)).max(), (stop, second, name)
 
 
-def test_what_needs_no_steps_is_not_stepped_unless_a_method_is_named():
-    frozen = fs.simulate(table1(), area="frozen", t_stop=1e-3)
-    assert (frozen.method, frozen.plan.tier, frozen.nfev) == ("linear", "linear", 0)
-    free = fs.simulate(table1(gap={"r": "inf"}, coat={"r": "inf"}, skin=None), t_stop=1e-3)
-    assert free.method == "exponential", "the skin leaks"
-    lines = ("V1 in 0 SIN(0 10 500)", "X1 in m area LAYER d=1u eps_r=4", "X2 m 0 area LAYER d=3u eps_r=1")
-    dry = fs.simulate(deck(*lines, "Varea area 0 40", ".tran 10u 1m uic"))
-    assert (dry.method, dry.plan.tier, dry.nfev) == ("algebraic", "algebraic", 0)
-    named = fs.simulate(table1(), area="frozen", t_stop=1e-3, method="radau")
-    assert (named.method, named.plan.tier, named.nfev > 0) == ("radau", "coupled", True)
-
-
 def test_an_explicit_method_of_torchdiffeq_that_gives_up_is_explained(monkeypatch):
     import torchdiffeq
 
@@ -180,12 +157,3 @@ def test_lsoda_s_nan_is_not_a_success():
     assert solution.status is fs.Status.FOLD
     assert not solution.success
     assert np.all(np.isfinite(solution.u_gap))
-
-
-def test_the_tolerance_is_relative_to_the_source():
-    # So small a voltage moves no area: the circuit is linear, and a thousandth of the source gives a thousandth of all.
-    evaluations = {
-        fs.simulate(table1(), sources={"Vdrive": fs.Sine(u, 100)}, t_stop=0.02, rtol=1e-6, method="radau").nfev
-        for u in (1e-3, 1e-6, 1e-9)
-    }
-    assert max(evaluations) <= 1.02 * min(evaluations)

@@ -1,7 +1,5 @@
 """Recordings on one finger in a network, against hand-written equations and the `exponential` method."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

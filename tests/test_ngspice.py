@@ -1,7 +1,5 @@
 """The shipped decks, unchanged, in ngspice 39 against this package's runs of the same files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

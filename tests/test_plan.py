@@ -1,7 +1,5 @@
 """The choice of the model: the right tier with its reason, and as accurate as the next heavier tier."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
@@ -126,9 +124,6 @@ def test_a_start_with_stored_charge_takes_the_mobile_law_out_of_the_algebraic_ti
         fs.plan(circuit, charge_law="mobile", tier="algebraic")
 
 
-# Each against the next heavier ------------------------------------------------------------------------------
-
-
 def both(circuit: fs.Circuit, light: str, heavy: str, seed: int, u: float, **options: Any) -> tuple[fs.Solution, ...]:
     rng = np.random.default_rng([seed, 5])
     f = 10.0 ** rng.uniform(1.5, 4.0)
@@ -217,9 +212,6 @@ def test_a_gap_that_takes_more_than_its_share_of_a_jump_is_not_taken_as_linear_t
         assert np.abs(solution.u_gap - exact.u_gap).max() <= solution.error.u_gap
 
 
-# Forcing ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("tier", ["algebraic", "linear", "coupled"])
 def test_a_heavier_model_may_always_be_asked_for(tier: str) -> None:
     solution = fs.simulate(dry(), tier=tier, area="frozen", rtol=1e-10)
@@ -275,9 +267,6 @@ def test_a_method_steps_whatever_the_model_could_have_been() -> None:
     solution = fs.simulate(dry(), method="radau", t_stop=2e-3, rtol=1e-9)
     assert (solution.plan.tier, solution.method) == ("coupled", "radau")
     agree(fs.simulate(dry(), t_stop=2e-3), solution)
-
-
-# Memory -----------------------------------------------------------------------------------------------------
 
 
 def test_a_plan_is_made_once_for_the_same_request() -> None:

@@ -19,7 +19,7 @@ from PIL import Image
 
 import fingerspice as fs
 from fingerspice.plots import drawing, traces
-from scenes import deck, shipped, table1
+from scenes import deck, listed, shipped, table1
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -180,9 +180,7 @@ def test_the_comparison_shows_its_table_which_has_room_for_the_names_of_several_
         assert all(left.x1 < right.x0 for left, right in itertools.pairwise(texts))
 
 
-def test_a_picture_has_150_dots_an_inch_or_more_and_a_folder_that_can_be_written(
-    sine: fs.Solution, tmp_path: Path
-) -> None:
+def test_a_picture_has_150_dots_an_inch_or_more_and_a_folder_that_can_be_written(sine, tmp_path):
     figure = traces.plot_solution(sine)
     with Image.open(drawing.save(figure, tmp_path / "new" / "run.png")) as image:
         assert image.format == "PNG"
@@ -190,19 +188,6 @@ def test_a_picture_has_150_dots_an_inch_or_more_and_a_folder_that_can_be_written
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["run.png"]
     with pytest.raises(fs.InputError, match="cannot write"):
         drawing.save(figure, tmp_path / "new" / "run.png" / "run.png")
-
-
-@pytest.mark.parametrize(
-    ("peak", "unit", "least", "factor", "shown"),
-    [
-        (0.05, "s", 1.0, 1e3, "ms"), (2e-4, "s", 1.0, 1e6, "µs"), (1e-3, "s", 1.0, 1e3, "ms"),
-        (1.0, "s", 1.0, 1.0, "s"), (0.21, "N", 0.05, 1.0, "N"), (0.004, "N", 0.05, 1e3, "mN"),
-        (200.0, "V", 2.0, 1.0, "V"), (0.0, "V", 2.0, 1.0, "V"), (math.nan, "V", 2.0, 1.0, "V"),
-        (3.5e-5, "m^2", 0.05, 1e6, "mm²"), (5e3, "mm^4/N^2", 1.0, 1.0, "mm^4/N^2"),
-    ],
-)  # fmt: skip
-def test_engineering_units(peak: float, unit: str, least: float, factor: float, shown: str) -> None:
-    assert drawing.engineering(peak, unit, least) == (pytest.approx(factor), shown)
 
 
 def test_thinning_keeps_every_extreme_and_both_ends() -> None:
@@ -245,15 +230,11 @@ def test_signals_that_are_asked_for_share_a_panel_with_their_like(sine: fs.Solut
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"signals": "fel"}, "unknown signal 'fel'; nearest: 'f_el'; allowed: u_source, "),
-        ({"signals": [3]}, "unknown signal 3"),
-        ({"signals": []}, "signals is empty"),
+        *listed("pictures"),
         *(
             ({"window": window}, r"window is .* s; allowed: ascending, with two outputs")
             for window in ((0.02, 0.01), (1.0, 2.0), (0.01, 0.010001))
         ),
-        ({"window": 3}, "window is 3; allowed: two times in s"),
-        ({"others": "x"}, "others is 'x'; allowed: Solutions"),
     ],
 )
 def test_what_a_picture_refuses(sine: fs.Solution, options: dict[str, Any], said: str) -> None:

@@ -1,7 +1,5 @@
 """Runs along recordings, against the independent reference and the `exponential` method; and their stated errors."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 
@@ -95,14 +93,13 @@ def test_two_sources_of_a_circuit_may_have_recordings_at_different_rates() -> No
     assert np.abs(run.u_gap - exact.u_gap).max() <= min(1e-6 * peak, run.error.u_gap)
 
 
-@pytest.mark.parametrize("number", [17, 57, 129, 158, 176])
+@pytest.mark.parametrize("number", [57, 129, 158, 176, 17][: cases(5, 4)])
 def test_what_the_sweeps_leave_is_stated(number: int) -> None:
     # The first changes from sweep to sweep had promised 4 to 8 times less than the next sweep changed, near a fold (17)
     # all changes did, and the charge (57) is off by what an error of the same sign in every block leaks.
-    # Code for the many modes of the first is compiled for it alone: in the suite for two of the tolerances.
-    rtols = recording_errors.RTOLS[: 4 if number != 17 else cases(4, 2)]
-    found = recording_errors.judge(recording_errors.draw(number), rtols)
-    assert len(found) == 4 * len(rtols)
+    # Code for the many modes of the last is compiled for it alone, in 14 s.
+    found = recording_errors.judge(recording_errors.draw(number))
+    assert len(found) == 4 * len(recording_errors.RTOLS)
     assert [x for x in found if not x.covered] == []
 
 
@@ -126,21 +123,6 @@ def test_stated_errors_cover_the_true_ones_and_what_was_asked_is_met() -> None:
     recording_errors.assert_that_stated_errors_hold(found)
 
 
-@every_law
-def test_outputs_are_one_solution_wherever_they_are(law: str) -> None:
-    samples = fs.Samples(recording(), RATE, start=0.4 / RATE)
-    stop = 0.01734
-    every = np.sort(np.append(np.linspace(0.0, stop, 37), np.arange(100) / RATE))
-    whole = follow(samples, stop, t_eval=every, charge_law=law, rtol=1e-6)
-    for part in (slice(0, None, 3), slice(30, 60), slice(every.size - 1, None)):
-        some = follow(samples, stop, t_eval=every[part], charge_law=law, rtol=1e-6)
-        for name in ("u_gap", "q_source", "i_source"):
-            # Samples are written by the block and other times one by one: alike but for rounding.
-            given, expected = getattr(some, name), getattr(whole, name)
-            assert np.abs(given - expected[part]).max() <= 1e-11 * np.abs(expected).max()
-    assert whole.method == "relaxation"
-
-
 def test_a_run_goes_on_where_another_has_ended() -> None:
     samples, stop = fs.Samples(recording(), RATE), 150.0 / RATE
     t = np.linspace(0.5 * stop, stop, 41)
@@ -161,17 +143,6 @@ def test_what_is_no_recording_is_stepped_as_ever() -> None:
     steep = follow(fs.Samples(recording(volts=900.0), RATE), 0.01, rtol=1e-6)
     assert {few.method, sine.method, steep.method} == {"exponential"}
     assert steep.success
-
-
-def test_charge_and_force_belong_to_the_gap_voltage() -> None:
-    run = follow(fs.Samples(recording(), RATE), 0.0195, t_eval=np.arange(150) / RATE, rtol=1e-8)
-    force = analytic.contact(np.abs(run.u_gap))[3]
-    assert np.abs(run.f_el - force).max() <= 1e-12 * force.max()
-    # The current is the charge's slope: between two samples both are smooth.
-    t = 20.3 / RATE + np.array([-1.0, 0.0, 1.0]) * 1e-3 / RATE
-    near = follow(fs.Samples(recording(), RATE), 0.0195, t_eval=t, rtol=1e-10)
-    slope = (near.q_source[2] - near.q_source[0]) / (t[2] - t[0])
-    assert near.i_source[1] == pytest.approx(slope, rel=1e-6)
 
 
 def test_figures_are_those_of_the_run_and_not_of_its_outputs() -> None:

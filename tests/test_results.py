@@ -1,7 +1,5 @@
 """Folder and names of a command's results, and files that are never replaced without a message."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -27,7 +25,10 @@ def test_results_stand_in_a_folder_that_git_ignores_unless_it_is_there_or_named(
 
 def test_files_take_the_name_given(command: Command) -> None:
     assert command("run", "pad.cir", "--name", "thin gap").code == 0
-    assert {"out/thin gap.nc", "out/thin gap.png"} <= set(tree(Path()))
+    for name in ("pad.v1", "pad.v2"):
+        Path(f"{name}.cir").write_text(Path("pad.cir").read_text())
+        assert command("run", f"{name}.cir", "--no-plot").code == 0
+    assert {"out/thin gap.nc", "out/thin gap.png", "out/pad.v1.nc", "out/pad.v2.nc"} <= set(tree(Path()))
     for name in ("a/b", "..", "", "../x", "a\nb"):
         result = command(*QUIET, "--name", name)
         assert result.code == 2

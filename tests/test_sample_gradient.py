@@ -1,7 +1,5 @@
 """Derivatives of a number by every sample of a recording, against fourth-order differences of runs at 1e-12."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Schematics: every element drawn once, nothing over anything else, files and answers to wrong requests."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import xml.etree.ElementTree as ET
@@ -15,25 +13,13 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 import fingerspice as fs
-from commands import Command
 from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic, place, put_beside
-from scenes import CIRCUITS, cases, shipped, table1
+from scenes import CIRCUITS, DECKS, cases, shipped, table1
 
-BRIDGE = """A bridge of long names, a delay, a fixed area and a current
-Vdrive_of_the_whole_bridge drive 0 SIN(0 200 5k) AC 2
-Rupper drive left 1k
-Rlower left 0 1k
-Cupper drive right 1n IC=5
-Clower right 0 1n
-Xacross left right spot LAYER d=1u eps_r=3.9
-Vspot spot 0 100
-Iextra 0 left SIN(0 1m 5k)
-.tran 1u 1m
-"""
 LADDER = "A ladder\nV1 n0 0 1\n" + "".join(
     f"R{k} n{k} n{k + 1} 1k\nC{k} n{k + 1} 0 1n\n" for k in range(12)
 ) + ".tran 1u 1m\n"  # fmt: skip
-OTHERS = {"bridge": BRIDGE, "ladder": LADDER}
+OTHERS = {"bridge": (DECKS / "bridge.cir").read_text("utf-8"), "ladder": LADDER}
 
 
 @pytest.fixture(params=[*sorted(p.stem for p in CIRCUITS.glob("*.cir")), *OTHERS])
@@ -112,7 +98,7 @@ def test_a_stack_is_one_ladder_beside_its_source() -> None:
 
 
 def test_areas_are_said_where_a_source_gives_one_and_a_resistor_is_drawn_where_a_layer_leaks() -> None:
-    said = [" ".join(texts(c.draw()._repr_svg_())) for c in (fs.parse_netlist(BRIDGE), table1())]
+    said = [" ".join(texts(c.draw()._repr_svg_())) for c in (fs.parse_netlist(OTHERS["bridge"]), table1())]
     assert "area = spot" in said[0]
     assert "DC 100 mm^2" in said[0]
     assert "area" not in said[1]
@@ -176,9 +162,7 @@ def test_the_picture_of_a_run_has_the_schematic_about_as_high_on_its_right() -> 
     assert box.width * whole.bbox.width / (box.height * whole.bbox.height) == pytest.approx(wide / high, rel=0.01)
 
 
-def test_run_writes_the_schematic_beside_its_picture_and_keeps_that_of_another_circuit(
-    command: Command, tmp_path: Path
-) -> None:
+def test_run_writes_the_schematic_beside_its_picture_and_keeps_that_of_another_circuit(command, tmp_path):
     run = ("run", str(CIRCUITS / "fingerpad.cir"), "--schematic", "--stop", "10m", "--out", str(tmp_path))
     file = tmp_path / "fingerpad_schematic.svg"
     for _ in range(2):

@@ -1,7 +1,5 @@
 """Sensitivities of a run by parameters, against differences of independent solutions, and what is refused."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -11,7 +9,7 @@ import analytic
 import fingerspice as fs
 from fingerspice.base.errors import InputError
 from network_reference import Floating, Tone
-from scenes import cases, deck, every_law, floating, shipped, table1
+from scenes import DECKS, cases, deck, every_law, floating, shipped, table1
 
 # Relative steps: the truncation of the difference is about 1e-12 of a signal, its rounding 1e-16 over the step.
 STEP = 2e-4
@@ -212,13 +210,7 @@ def test_points_at_uneven_times_have_them(table_1: fs.Circuit) -> None:
 
 def test_without_leaks_a_gap_divides_the_voltage() -> None:
     # u_gap = U / (1 + d1 / (eps1 d)): the capacitances of a series stack, whatever the area.
-    deck = """divider
-.include fingerspice.lib
-V1 a 0 SIN(0 100 50)
-X1 a b area LAYER d=2u eps_r=4
-X2 b 0 area GAP d=3u fn=0.5
-.tran 1m 40m uic
-.end"""
+    deck = (DECKS / "divider.cir").read_text()
     circuit = fs.parse_netlist(deck)
     run = fs.simulate(circuit, sensitivities=("X2.d", "X1.d", "X1.eps_r"), rtol=1e-9)
     share = 1.0 + 2.0 / (4.0 * 3.0)

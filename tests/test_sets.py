@@ -1,7 +1,5 @@
 """Named sets of parameters: their files, what they make of a circuit, and what is cited for a run."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json
@@ -19,7 +17,7 @@ from commands import Command
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.scene import EXAMPLES
 from fingerspice.sets import DATA, ELEMENTS, KINDS, WAVEFORMS, keys_in, references, tables
-from scenes import shipped
+from scenes import listed, shipped
 
 ROOT = Path(__file__).parents[1]
 CIRCUITS = ROOT / "circuits"
@@ -244,24 +242,7 @@ def test_a_dispersive_skin_has_no_f_and_takes_its_thickness() -> None:
 # Names, tables and bad input.
 
 
-def test_names_are_read_in_upper_and_lower_case() -> None:
-    for name in ("FORSBACH2021", " forsbach2021 ", "Forsbach2021"):
-        assert fs.parameters(name).name == "Forsbach2021"
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        (("moits",), "unknown set 'moits'; nearest: 'moist'"),
-        (("Forsbach",), "nearest: 'Forsbach2021'"),
-        (("xyz",), "unknown set 'xyz'; allowed: Forsbach2021, "),
-        (("",), "unknown set ''; allowed: Forsbach2021, "),
-        ((3,), "parameters is given 3, a int; allowed: the name of a set"),
-        (("3m", "finger"), "the set '3M' is a coating, not a finger; allowed: dry, moist, normal, "),
-        (("moits", "finger"), "unknown finger set 'moits'; nearest: 'moist'"),
-        (("moist", "toe"), "kind is 'toe'; allowed: scene, finger, load, coating, drive"),
-    ],
-)
+@pytest.mark.parametrize(("given", "said"), listed("sets"))
 def test_an_unknown_set_or_one_of_another_kind_is_refused_with_what_is_allowed(given: tuple, said: str) -> None:
     with pytest.raises(fs.InputError, match=re.escape(said)):
         fs.parameters(*given)
@@ -426,44 +407,6 @@ def test_the_options_apply_sets_and_later_ones_have_the_last_word(command: Comma
     assert sets == ["Forsbach2021", "light", "dry"]
     assert [changed[f"Xgap.{key}"] for key in ("r", "mu", "fn")] == ["2meg", "0.2", "0.2"]
     assert applied(command)[0] == applied(command, "--set", "Xgap.d=3u")[0] == []
-
-
-def test_a_run_on_the_command_line_is_that_of_python_and_its_file_cites(command: Command, pad: fs.Circuit) -> None:
-    Path("own.cir").write_text(PAD.read_text())
-    result = command("run", "own.cir", "--no-plot", "--finger", "moist", "--stop", "10m")
-    assert result.code == 0
-    assert f"{pad.title} (changed: set moist)" in result.out
-    loaded = fs.load("out/own.nc")
-    expected = fs.simulate(with_set("moist", pad), t_stop=1e-2)
-    np.testing.assert_array_equal(loaded.f_el, expected.f_el)  # type: ignore[arg-type]
-    assert str(loaded.cite()) == str(expected.cite())
-
-
-def test_one_of_several_fingers_may_be_named(command: Command) -> None:
-    Path("two.cir").write_text((CIRCUITS / "two_fingers.cir").read_text())
-    _, changed = applied(command, "--finger", "Xlight=moist", "--finger", "xfirm = dry", deck="two.cir")
-    assert [changed[f"{one}.Xgap.r"] for one in ("Xlight", "Xfirm")] == ["100000.0", "7000000.0"]
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("run --finger 3M", "--finger '3M': the set '3M' is a coating, not a finger; allowed: dry, moist, normal"),
-        ("run --finger moits", "--finger 'moits': unknown finger set 'moits'; nearest: 'moist'"),
-        ("run --drive Xgap=TeslaTouch", "--drive 'Xgap=TeslaTouch': the set 'TeslaTouch' has values for a driving"),
-        ("run --coating Xlayer=3M", "a LAYER, which 'Xlayer' of the circuit lacks; allowed: its Xcoat"),
-        ("plan --set moits", "--set 'moits': unknown set 'moits'; nearest: 'moist', 'light'; or PATH=VALUE"),
-        ("compare --set ", "--set '' is not understood; allowed: PATH=VALUE"),
-        ("ac --finger moist", "--finger 'moist' is a set of parameters, and here a GAP is meant; allowed: --set mo"),
-        ("ac --finger Xgpa", "Xgpa"),
-    ],
-)
-def test_wrong_names_on_the_command_line_are_refused(command: Command, words: str, said: str) -> None:
-    kind, *options = words.split(" ")
-    result = command(kind, "pad.cir", *options)
-    assert result.code == 2
-    assert said in result.err
-    assert "Traceback" not in result.err
 
 
 def test_the_sets_are_listed_and_shown(command: Command) -> None:

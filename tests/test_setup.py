@@ -1,7 +1,5 @@
 """`make test` without an installed ngspice."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -22,7 +20,7 @@ def bare(folder: Path, *commands: str, **scripts: str) -> dict[str, str]:
     for name, text in scripts.items():
         (folder / name.replace("_", "-")).write_text(f"#!/bin/sh\n{text}\n")
         (folder / name.replace("_", "-")).chmod(0o755)
-    return {**{k: v for k, v in os.environ.items() if k != "CI"}, "PATH": str(folder)}
+    return {**{k: v for k, v in os.environ.items() if k not in ("CI", "PYTEST_XDIST_WORKER")}, "PATH": str(folder)}
 
 
 def suite(folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
@@ -60,9 +58,7 @@ INSTALL = "echo $@ >> {{log}}; [ $1 = update ] || cp {{true}} {{here}}/{}"
         ({"ngspice": "exit 0"}, ""),
     ],
 )
-def test_programs_are_installed_where_that_takes_no_question(
-    tmp_path: Path, scripts: dict[str, str], said: str
-) -> None:
+def test_programs_are_installed_where_that_takes_no_question(tmp_path, scripts, said):
     log, true = tmp_path / "log", shutil.which("true")
     filled = {
         k: v.format(log=log, here=tmp_path, true=true) for k, v in ({"chromium": "exit 0"} | scripts).items() if v

@@ -1,7 +1,5 @@
 """The result of a run: its output rows, its arrays and copies of it, its figures, and its files."""
 
-from __future__ import annotations
-
 import copy
 import csv
 import dataclasses
@@ -18,7 +16,6 @@ import xarray
 import analytic as ref
 import fingerspice as fs
 from commands import tree
-from fingerspice.base import files
 from fingerspice.base.files import write_aside
 from fingerspice.results.record import SIGNALS
 from scenes import deck, shipped, table1
@@ -42,9 +39,6 @@ def rows(path: Path) -> tuple[list[str], np.ndarray]:
     with path.open(newline="") as stream:
         head, *body = csv.reader(stream)
     return head, np.array(body, float)
-
-
-# Times and arrays
 
 
 def test_times_are_the_output_grid_with_two_rows_at_each_jump_after_the_start(square: fs.Solution) -> None:
@@ -133,9 +127,6 @@ def test_a_jump_of_one_source_is_not_hidden_by_that_of_another() -> None:
     assert np.count_nonzero(np.diff(fs.simulate(circuit).t) == 0.0) == 1
 
 
-# Arrays and copies
-
-
 def test_arrays_are_read_only_and_the_result_is_frozen(square: fs.Solution) -> None:
     arrays = [*(value for value, _, _ in square.signals.values()), fs.Samples([1.0, 2.0], 1.0).values]
     for array in (square.t, square.u_layer, *arrays, *square.node_voltages.values()):
@@ -187,9 +178,6 @@ def test_every_signal_has_its_unit_and_is_that_of_its_name(square: fs.Solution) 
     np.testing.assert_array_equal(square.friction, square.f_t / 0.5)
 
 
-# Figures
-
-
 def test_figures_of_the_source_of_a_square_are_by_hand(square: fs.Solution) -> None:
     s = square.summary()
     assert s["u_source_rms"] == pytest.approx(200.0, rel=1e-12)
@@ -198,15 +186,8 @@ def test_figures_of_the_source_of_a_square_are_by_hand(square: fs.Solution) -> N
 
 
 def test_a_circuit_without_gap_has_figures_of_its_layers(tmp_path: Path) -> None:
-    solution = fs.simulate(
-        deck(
-            "V1 a 0 SIN(0 10 100)",
-            "X1 a b area LAYER d=1u eps_r=2 r=1meg",
-            "X2 b 0 area LAYER d=2u eps_r=3 r=1meg",
-            "Varea area 0 35",
-            ".tran 100u 20m uic",
-        )
-    )
+    layers = "X1 a b area LAYER d=1u eps_r=2 r=1meg", "X2 b 0 area LAYER d=2u eps_r=3 r=1meg"
+    solution = fs.simulate(deck("V1 a 0 SIN(0 10 100)", *layers, "Varea area 0 35", ".tran 100u 20m uic"))
     s = solution.summary()
     assert (s["t_stop"], s["status"]) == (0.02, "SUCCESS")
     top = solution.u_layer[:, 0].max()
@@ -214,9 +195,6 @@ def test_a_circuit_without_gap_has_figures_of_its_layers(tmp_path: Path) -> None
     assert not [key for key in s if key.startswith(("f_el", "u_gap", "friction"))]
     assert load(solution.to_netcdf(tmp_path / "a.nc")).identical(solution.to_xarray())
     assert "f_el" not in solution.to_xarray()
-
-
-# Files
 
 
 def test_netcdf_holds_what_to_xarray_gives(square: fs.Solution, tmp_path: Path) -> None:
@@ -303,43 +281,27 @@ def test_a_failed_run_keeps_what_came_before_it(tmp_path: Path) -> None:
     assert [s.name for s in fs.Status if "success" in s.value] == ["SUCCESS"]
 
 
-def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full(
-    square: fs.Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(path: Path, write_to: Any) -> Path:
+def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full_or_writing_is_interrupted(square, tmp_path, monkeypatch):
+    def broken_off(path: Path, write_to: Any) -> Path:
         def half(target: Path) -> None:
             target.write_text("half of a file")
-            raise OSError(errno.ENOSPC, "No space left on device")
+            raise error
 
         return write_aside(path, half)
 
-    monkeypatch.setattr("fingerspice.base.files.write_aside", full)
-    for there in ({}, {"run.dat": b"before"}):
-        for name, content in there.items():
-            (tmp_path / name).write_bytes(content)
-        for write in (square.to_csv, square.to_netcdf):
-            with pytest.raises(fs.InputError, match=r"cannot write .*run\.dat: No space left on device"):
-                write(tmp_path / "run.dat")
-            assert tree(tmp_path) == there
-
-
-def test_nothing_is_left_when_writing_breaks_off_for_any_reason(tmp_path: Path) -> None:
-    def interrupted(target: Path) -> None:
-        target.write_text("half")
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_aside(tmp_path / "x.csv", interrupted)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_made_is_refused(square: fs.Solution, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    for path in (tmp_path / "file" / "run.nc", tmp_path / "file" / "deeper" / "run.nc"):
-        with pytest.raises(fs.InputError, match=r"cannot write .*allowed: a folder that can be written"):
-            square.to_netcdf(path)
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
-    assert files.write_aside(tmp_path / "new" / "x.txt", lambda p: p.write_text("x")).read_text() == "x"
+    monkeypatch.setattr("fingerspice.base.files.write_aside", broken_off)
+    for error, told, said in (  # noqa: B007
+        (OSError(errno.ENOSPC, "No space left on device"), fs.InputError, r"write .*run\.dat: No space left on device"),
+        (KeyboardInterrupt(), KeyboardInterrupt, None),
+    ):
+        for there in ({}, {"run.dat": b"before"}):
+            for name, content in there.items():
+                (tmp_path / name).write_bytes(content)
+            for write in (square.to_csv, square.to_netcdf):
+                with pytest.raises(told, match=said):
+                    write(tmp_path / "run.dat")
+                assert tree(tmp_path) == there
+        (tmp_path / "run.dat").unlink()
 
 
 def test_states_status_and_elements_show_themselves_in_one_short_line(square: fs.Solution) -> None:

@@ -1,8 +1,5 @@
 """Recordings and tables from files: reading by decks, the command line and Python, and refused files."""
 
-from __future__ import annotations
-
-import contextlib
 import itertools
 import os
 import struct
@@ -20,7 +17,7 @@ from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.netlist import reader
 from fingerspice.waveforms import files
-from scenes import cases, table1_deck
+from scenes import listed, table1_deck
 
 GUID = bytes.fromhex("800000aa00389b71")
 
@@ -200,9 +197,7 @@ def test_a_malformed_file_gives_the_same_values_or_the_same_refusal_at_once_and_
 
 @pytest.mark.parametrize("size", [0xFFFFFFFF, 0x7FFFF000])
 @pytest.mark.parametrize("kind", ["i2", "i3", "f8"])
-def test_a_stream_whose_header_does_not_know_its_end_is_read_to_the_end_of_the_file(
-    kind: str, size: int, tmp_path: Path
-) -> None:
+def test_a_stream_whose_header_does_not_know_its_end_is_read_to_the_end_of_the_file(kind, size, tmp_path):
     sound, live = tmp_path / "sound.wav", tmp_path / "live.wav"
     sound.write_bytes(pieced(kind))
     live.write_bytes(pieced(kind, size=size, whole=0xFFFFFFFF))
@@ -231,19 +226,6 @@ def test_channels_and_gains_that_cannot_be_are_refused(at_once: bool, in_folder:
     assert said == "'c.wav': a sample is 1.5e+12 V; allowed: a size up to 1e+12"
     Path("c.wav").write_bytes(wav(bytes(18)))
     assert fs.Samples.from_wav("c.wav", 3e12, at_once=at_once).peak(0.0, 1.0) == 0.0
-
-
-def test_broken_headers_are_refused_in_one_sentence(tmp_path: Path) -> None:
-    random = np.random.default_rng(1)
-    path = tmp_path / "a.wav"
-    for _ in range(cases(300, 100)):
-        data = bytearray(STEREO if random.random() < 0.5 else wav(packed(np.arange(9), 3), 24, extensible=True))
-        for place in random.integers(0, 60, random.integers(1, 4)):
-            data[place] = random.integers(256)
-        path.write_bytes(data)
-        # Anything but a refusal would end the test.
-        with contextlib.suppress(fs.InputError):
-            fs.Samples.from_wav(path, 1.0, 0)
 
 
 def test_files_beyond_the_limits_are_refused_unread(in_folder: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,19 +257,7 @@ def test_what_is_no_file_is_refused(in_folder: None) -> None:
 # Tables -------------------------------------------------------------------------------------------------------
 
 
-TABLES: dict[str, str] = {
-    "commas": "0,1\n0.001,-2.5\n0.003,4\n",
-    "commas and blanks": "0, 1\n0.001 , -2.5\n 0.003, 4\n",
-    "blanks": "0 1\n  0.001   -2.5\n0.003 4",
-    "tabs": "0\t1\n0.001\t-2.5\n0.003\t4\n",
-    "header": "time,u\n0,1\n0.001,-2.5\n0.003,4\n",
-    "units": "time (ms), u [kV]\n0,0.001\n1,-0.0025\n3,0.004\n",
-    "header of NumPy": "# taken on a rainy day\n# t (s), u (V)\n0,1\n1e-3,-2.5\n3e-3,4\n",
-    "quoted": '"time (us)","drive (mV)"\r\n"0","1000"\r\n"1000","-2500"\r\n"3000","4000"\r\n',
-    "SPICE": "0 1\n1m -2500m\n3m 4\n",
-    "comments": "# one\n\n0,1\n# two\n0.001,-2.5\n\n0.003,4\n",
-    "utf-8 with a mark": "\ufefft,u\n0,1\n0.001,-2.5\n0.003,4\n",
-}
+TABLES: dict[str, str] = dict(listed("two_columns"))
 
 
 @pytest.mark.parametrize("text", TABLES.values(), ids=TABLES.keys())
@@ -322,22 +292,6 @@ def test_arrays_of_numpy_are_columns(tmp_path: Path) -> None:
     np.savez(path, u=np.array([1.0, 3.0, -2.0]), t=np.arange(3) / 48000, rate=48000)
     assert fs.Samples.from_table(path).rate == 48000.0
     assert "is a table with a rate; allowed: one with times" in refusal(fs.PWL.from_table, path)
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ((["a", "b"], 1e3), "the row of samples is ['a', 'b'], a list of texts; allowed: two or more numbers in V"),
-        (([[1], [1, 2]], 1e3), "the row of samples is [[1], [1, 2]], a list; allowed"),
-        (([1j, 2j], 1e3), "the row of samples is [1j, 2j], a list of complex numbers; allowed"),
-        (([[1.0, 2.0]], 1e3), "samples is shape (1, 2); allowed: one row of two or more"),
-        (([1.0, 2.0], "48k"), "Samples rate is '48k'; allowed: a number of Hz"),
-        (([1.0, 2.0], None), "Samples rate is None; allowed: a number of Hz"),
-        (([1.0, 2.0], 1e3, "0"), "Samples start is '0'; allowed: a number of s"),
-    ],
-)
-def test_what_makes_no_samples_is_refused(given: tuple[Any, ...], said: str) -> None:
-    assert said in refusal(fs.Samples, *given)
 
 
 MICRO = "t (\xb5s),drive (V)\n0,0\n1000,10\n2000,20\n3000,0\n".encode("latin-1")
@@ -375,57 +329,8 @@ def test_a_file_of_a_pwl_alternates_times_and_values(text: str, folder: Path) ->
     assert "the time 0.0005 s follows 0.001 s" in refusal(source, "PWL FILE=line.txt")
 
 
-STEPPED = (
-    "time\tV(n001)\nStep Information: R=1k  (Run: 1/2)\n0\t0\n1e-3\t10\n"
-    "Step Information: R=2k  (Run: 2/2)\n0\t0\n1e-3\t5\n"
-)
-BAD_TABLES: list[tuple[str, dict[str, object], str]] = [
-    ("", {}, "'a.csv' is empty"),
-    ("\n\n", {}, "'a.csv' holds no rows of numbers"),
-    ("# nothing\nt,u\n", {}, "'a.csv' holds no rows of numbers"),
-    ("t;u\n0;1\n", {}, "'a.csv', line 2: the table separates by semicolons; allowed: commas, tabs or blanks"),
-    ("t;u\n0,5;1,5\n", {}, "'a.csv', line 2: the table separates by semicolons and writes decimal commas; allowed"),
-    ("t\tu\n0,5\t1,5\n", {}, "'a.csv', line 2: 0,5 has a decimal comma; allowed: points, 0.5"),
-    ("0 1,5\n", {}, "'a.csv', line 1: 1,5 has a decimal comma; allowed: points, 1.5"),
-    ('"t","u"\n0,5,1,5\n', {}, "are its commas decimal commas?"),
-    ("t,u\n0,1\n1,nan\n2,3\n", {}, "'a.csv', line 3: column 'u' is nan; allowed: finite numbers"),
-    ("0,1\n\n1,inf\n", {}, "'a.csv', line 3: column 1 is inf"),
-    ("nan,1\n1,2\n", {}, "'a.csv', line 1: column 0 is nan"),
-    ("0,1\n1,\n", {}, "'a.csv', line 2: the cell in column 1 is empty; allowed: numbers"),
-    ("0,1\n,2\n", {}, "'a.csv', line 2: the cell in column 0 is empty"),
-    ("0,1\n1,2k7\n", {}, "'a.csv', line 2: '2k7' differs between simulators: write 2.7k"),
-    ("0,1\n1,2,3\n", {}, "'a.csv', line 2 has 3 cells; allowed: 2, as in the first row"),
-    ("t,u\n0,1,2\n", {}, "'a.csv', line 1: the header names 2 columns, and the rows have 3: is a name missing?"),
-    ("t,u\n0,1\n2,3\n1,3\n", {}, "'a.csv', line 4: the time 1 s follows 2 s; allowed: not decreasing"),
-    ("0,1\n1,2\n", {"time": "t", "value": "u"}, "'a.csv' has no header that names a column 't'; allowed: its number"),
-    ("t,u\n0,1\n1,2\n", {"value": "v"}, "'a.csv' has no column 'v'; it has 2 columns (t, u)"),
-    ("t,u\n0,1\n1,2\n", {"value": 2}, "'a.csv' has no column 2; it has 2 columns (t, u)"),
-    ("t,u\n0,1\n1,2\n", {"time": "t", "value": "t"}, "the column 't' is both time and value; allowed: two columns"),
-    ("t,a,b\n0,1,2\n", {}, "'a.csv' has 3 columns (t, a, b); allowed: name the column of the value"),
-    ("0,1,2\n", {}, "'a.csv' has 3 columns without a header (0 to 2); allowed: the number of the column of the time"),
-    ("0,1,2\n", {"time": 0}, "(0 to 2); allowed: the number of the column of the value"),
-    ("1,0\n0,1\n", {}, "2: the time 0 s follows 1 s (without a header, the first of two columns is the times); all"),
-    ("1,0\n0,1\n", {"time": 0}, "line 2: the time 0 s follows 1 s; allowed: not decreasing"),
-    ("u,u\n0,1\n", {"value": "u"}, "'a.csv' has several columns 'u'"),
-    ("t (h),u\n0,1\n", {}, "the unit of column 't' is 'h'; allowed: s, ms, us, ns"),
-    ("t,u (N)\n0,1\n", {}, "the unit of column 'u' is 'N'; allowed: V, mV, uV, kV, A"),
-    ("1\n2\n", {}, "has one column and no rate; allowed: a column of times too, or rate= in Hz; PWL FILE= takes alt"),
-    ("0\n0\n1m\n10\n", {"value": 0}, "rate= in Hz; PWL FILE= takes alternating times and values"),
-    ("t,u,i,on\n0,0,1,1\n1,1,nan,\n", {"value": "i"}, "line 3: column 'i' is nan; allowed: finite numbers"),
-    ("t,u,i,on\n0,0,1,1\n1,1,nan,\n", {"value": "on"}, "line 3: the cell in column 3 is empty"),
-    (
-        STEPPED,
-        {},
-        "line 5: the table holds 2 runs of .step, here 'Step Information: R=2k  (Run: 2/2)'; allowed: one run",
-    ),
-    ("a\0b", {}, "'a.csv' is no text; allowed: a table as text, or an NPZ file"),
-]
-
-
-@pytest.mark.parametrize(("text", "given", "said"), BAD_TABLES, ids=[said for *_, said in BAD_TABLES])
-def test_what_is_no_table_is_refused_with_its_line(
-    text: str, given: dict[str, object], said: str, in_folder: None
-) -> None:
+@pytest.mark.parametrize(("text", "given", "said"), listed("tables"), ids=[said for *_, said in listed("tables")])
+def test_what_is_no_table_is_refused_with_its_line(text, given, said, in_folder):
     Path("a.csv").write_text(text)
     assert said in refusal(fs.PWL.from_table, "a.csv", **given)
 
@@ -570,39 +475,7 @@ def test_decks_name_files_beside_them(folder: Path) -> None:
     same(part, fs.Samples.from_wav(stereo, 7.0, 0))
 
 
-BAD_SOURCES = [
-    ("WAVEFILE(mono.wav)", "3:16: WAVEFILE has no gain, the V at full scale; allowed: WAVEFILE(path gain"),
-    ("WAVEFILE mono.wav 150", "WAVEFILE names no file; allowed: WAVEFILE(path gain [channel])"),
-    ("WAVEFILE(mono.wav 150 1)", "'decks/mono.wav' has no channel 1; allowed: channel=0, its only one"),
-    ("WAVEFILE(mono.wav 150 0.5)", "channel is 0.5; allowed: a whole number"),
-    ("WAVEFILE(mono.wav 150 0 7)", "WAVEFILE takes at most 3 values, 4 given"),
-    ("WAVEFILE(mono.wav 150 gain=3)", "WAVEFILE has 'gain' twice"),
-    ("WAVEFILE(mono.wav 150 volume=3)", "WAVEFILE has no parameter 'volume'"),
-    ("WAVEFILE(mono.wav loud)", "gain is 'loud'; allowed: a number"),
-    ('WAVEFILE("data/stereo one.wav" 150)', "has 2 channels and none is chosen; allowed: channel=0 to 1"),
-    ("WAVEFILE(mno.wav 150)", "3:25: 'mno.wav' does not exist; did you mean 'mono.wav'?"),
-    ("WAVEFILE(data 150)", "'decks/data' is a folder, not a file"),
-    ("WAVEFILE(table.csv 150)", "'decks/table.csv' is no WAV file"),
-    ("WAVEFILE(../outside.wav 150)", "'../outside.wav' lies outside the netlist's folder, where nothing is read"),
-    ("WAVEFILE(data/../../outside.wav 150)", "lies outside the netlist's folder"),
-    ("WAVEFILE(link.wav 150)", "'link.wav' lies outside the netlist's folder"),
-    ("TABLE(/etc/passwd)", "'/etc/passwd' lies outside the netlist's folder"),
-    ("PWL FILE=/etc/passwd", "'/etc/passwd' lies outside the netlist's folder"),
-    ("wavefile=../outside.wav", "'../outside.wav' lies outside the netlist's folder"),
-    ("wavefile=mono.wav gain=3", "Vdrive takes no parameter 'gain' beside wavefile=; allowed: chan="),
-    ("TABLE()", "TABLE names no file; allowed: TABLE(path [time_column value_column])"),
-    ("TABLE(table.csv)", "'decks/table.csv' has 3 columns (time, left, right); allowed: name the column of the value"),
-    ("TABLE(table.csv time up)", "'decks/table.csv' has no column 'up'"),
-    ("TABLE(points.txt upsample=4)", "TABLE upsample goes with a rate, and this table has times"),
-    ("PWL(0 0 1 1 file=points.txt)", "PWL has points and file= too; allowed: one of them"),
-    ("CHIRP(150 20 2k)", "CHIRP needs 4 values, 3 given; allowed: CHIRP(amplitude f0 f1 duration)"),
-    ("BURST(200 5k)", "BURST needs 3 values, 2 given; allowed: BURST(amplitude frequency cycles every)"),
-    ("BURST(200 0 10)", "sine frequency is 0 Hz; allowed: > 0"),
-    ("BURST(200 5k 0)", "burst duration is 0 s; allowed: > 0"),
-]
-
-
-@pytest.mark.parametrize(("text", "said"), BAD_SOURCES, ids=[text for text, _ in BAD_SOURCES])
+@pytest.mark.parametrize(("text", "said"), listed("files"), ids=[text for text, _ in listed("files")])
 def test_files_that_a_deck_may_not_or_cannot_read_are_refused_with_its_line(text: str, said: str, folder: Path) -> None:
     Path("decks/link.wav").symlink_to(folder / "outside.wav")
     message = refusal(source, text)
@@ -616,31 +489,6 @@ def test_all_files_of_a_deck_together_have_a_limit(folder: Path, monkeypatch: py
     source("WAVEFILE(mono.wav 150)")
     said = "decks/pad.cir:8:25: the sources' files are larger than"
     assert said in refusal(source, "WAVEFILE(mono.wav 150)", twice)
-
-
-BURST = fs.Burst(fs.Sine(200.0, 5000.0), 10.0 / 5000.0)
-
-
-@pytest.mark.parametrize(
-    ("text", "wave"),
-    [
-        ("CHIRP(150 20 2k 0.3)", fs.Chirp(150.0, 20.0, 2000.0, 0.3)),
-        ("BURST(200 5k 10)", BURST),
-        ("BURST(200 5k 10 10m)", fs.Repeat(BURST, 0.01)),
-        ("AM(200 5k 50)", fs.AM(200.0, 5e3, 50.0)),
-        ("am(200, 5k, 50, 0.5)", fs.AM(200.0, 5e3, 50.0, 0.5)),
-        ("TRIANGLE(200 100)", fs.Triangle(200.0, 100.0)),
-        ("sawtooth(200 100)", fs.Sawtooth(200.0, 100.0)),
-    ],
-)
-def test_waveforms_of_a_deck_the_command_line_and_python_are_the_same(
-    command: Command, text: str, wave: fs.Waveform
-) -> None:
-    if not text.lower().startswith("am"):  # Which a deck does not take, as simulators differ about it.
-        assert fs.parse_netlist(table1_deck(text))["Vdrive"].waveform == wave
-    assert fs.read_netlist("pad.cir").replace({"Vdrive": text})["Vdrive"].waveform == wave
-    result = command("plan", "pad.cir", "--source", text, "--json")
-    assert result.code == 0, result.err
 
 
 # On the command line ------------------------------------------------------------------------------------------
@@ -697,35 +545,3 @@ def test_a_recording_longer_than_the_run_is_told(command: Command, deck: str, so
     assert told in command(*words).err
     for stop in ("20m", "0.099875"):
         assert "the recording ends" not in command(*words, "--stop", stop).err
-
-
-def test_start_and_stop_replace_those_of_the_deck(command: Command) -> None:
-    done = command("run", "pad.cir", "--start", "12m", "--stop", "18m", "--csv", "--no-plot")
-    assert done.code == 0
-    table = np.loadtxt("out/pad.csv", delimiter=",", skiprows=1)
-    assert (table[0, 0], table[-1, 0]) == (0.012, 0.018)
-    np.testing.assert_allclose(np.diff(table[:, 0]), 50e-6, rtol=1e-9)
-    # The run itself begins at 0.
-    whole = fs.simulate(fs.read_netlist("pad.cir"), t_eval=table[:, 0], t_stop=0.018)
-    assert whole.u_gap is not None
-    header = Path("out/pad.csv").read_text().splitlines()[0].split(",")
-    column = next(i for i, name in enumerate(header) if name.startswith("u_gap"))
-    np.testing.assert_allclose(table[:, column], whole.u_gap, atol=1e-5)
-
-
-def test_a_name_that_no_file_has_is_refused_in_one_sentence(command: Command) -> None:
-    for name in ("x" * 400, "~nobody_of_this_name/a"):
-        result = command("run", "pad.cir", "--source", f"WAV({name}.wav 150)", "--no-plot")
-        assert result.code == 2
-        assert "cannot be read" in result.err
-        assert len(result.lines) == 1
-
-
-def test_options_of_other_simulators_get_a_note_and_no_warning(command: Command) -> None:
-    Path("own.cir").write_text(edited(QUICK, (".end", ".options reltol=1e-4 trtol=7\n.end")))
-    result = command("plan", "own.cir")
-    assert result.code == 0
-    assert (
-        "fingerspice: note: .options reltol, trtol: of no effect here, where --rtol alone sets the error" in result.err
-    )
-    assert "warning" not in result.err

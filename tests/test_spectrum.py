@@ -1,7 +1,5 @@
 """Spectra: Parseval's theorem, known tones, the confidence interval of a density, and refused arguments."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from pathlib import Path
@@ -11,7 +9,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.results.spectrum import equivalent_segments, interval
-from scenes import deck, table1
+from scenes import deck, listed, table1
 
 RATE = 8000.0
 
@@ -148,23 +146,7 @@ def test_a_signal_that_jumps_at_the_end_of_its_period_is_periodic(jumps: str) ->
     assert 0.99 < found.shown_variance / found.variance < 1.0
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"signal": "force"}, "unknown signal 'force'"),
-        ({"signal": "u_layer"}, "allowed: u_layer:Xcoat, u_layer:Xgap, u_layer:Xskin"),
-        ({"method": "fft"}, "'auto', 'lines', 'welch'"),
-        ({"highest": -1.0}, "a number of Hz, > 0"),
-        ({"highest": 50.0}, "100 Hz, the lowest line"),
-        ({"highest": 1e9}, "to 1e\\+06 Hz"),
-        ({"resolution": math.nan}, "a number of Hz, > 0"),
-        ({"resolution": 1e-3}, "one over the length of the run"),
-        ({"resolution": 1e5}, "one over the length of the run"),
-        ({"method": "lines", "since": 0.01}, "go with method 'welch'"),
-        ({"since": 1.0}, "a time before the end of the run"),
-        ({"method": "welch", "since": 0.0499}, "64 outputs or more"),
-    ],
-)
+@pytest.mark.parametrize(("options", "said"), [*listed("spectra"), ({"resolution": math.nan}, "a number of Hz, > 0")])
 def test_what_a_spectrum_refuses(sine: fs.Solution, options: dict[str, object], said: str) -> None:
     with pytest.raises(fs.InputError, match=said):
         sine.spectrum(**options)  # type: ignore[arg-type]

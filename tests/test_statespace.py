@@ -1,6 +1,4 @@
-"""State space of series stacks, written in any order and direction, against a dense formulation."""
-
-from __future__ import annotations
+"""Circuits: refused topologies, parameters as data, and series stacks in any order against a dense formulation."""
 
 import math
 from dataclasses import dataclass
@@ -114,29 +112,6 @@ def test_rates_and_voltages_have_their_digits_though_rates_are_decades_apart_or_
     np.testing.assert_allclose(solution.u_layer * signs, np.array(voltages)[:, back], rtol=0, atol=200.0 * 1e-12)
 
 
-@pytest.mark.parametrize("n", range(1, 9))
-def test_n_layers_have_n_voltages_and_n_minus_one_live_states(n: int) -> None:
-    layers = [Slice(1e-6 * (i + 1), 2.0 + i, r=1e6) for i in range(n)]
-    circuit = chain(layers, [False] * n, list(range(n + 2)), "Vdrive n0 0 SIN(0 10 1k)")
-    solution = fs.simulate(circuit, rtol=1e-6)
-    assert solution.u_layer.shape == (solution.t.size, n)
-    assert solution.state.y.size == n, "n - 1 voltages and the charge"
-    np.testing.assert_allclose(solution.u_layer.sum(1), solution.u_source, rtol=0, atol=1e-12 * 10.0)
-
-
-@pytest.mark.parametrize("n", [1, 3, 8])
-def test_without_resistors_the_voltages_split_by_the_inverse_capacitances_for_ever(n: int) -> None:
-    layers = [Slice(1e-6 * (i + 1), 2.0 + i) for i in range(n)]
-    circuit = chain(layers, [False] * n, list(range(n + 2)), "Vdrive n0 0 SQUARE(10 1k)")
-    solution = fs.simulate(circuit)
-    share = np.array([1.0 / x.c for x in layers]) / sum(1.0 / x.c for x in layers)
-    np.testing.assert_allclose(solution.u_layer, np.outer(solution.u_source, share), rtol=0, atol=1e-14 * 10.0)
-    assert all(rate == 0.0 for rate in fs.plan(circuit).rates)
-
-
-# Sources ----------------------------------------------------------------------------------------------------
-
-
 def test_sources_in_series_add_with_their_directions_and_their_nodes_have_their_potentials() -> None:
     layers = ("Xcoat n1 n2 area LAYER d=1u eps_r=3.9 r=0.2meg", "Xair n3 0 area LAYER d=3.5u eps_r=1 r=1meg")
     circuit = deck("Va n0 0 7", "Vb n1 n0 3", *layers, "Vc n2 n3 SIN(0 2 1k)", "Varea area 0 35", ".tran 20u 1m uic")
@@ -177,14 +152,6 @@ def test_every_layer_spans_its_own_nodes_and_turning_one_turns_its_sign(made, ba
         np.testing.assert_allclose(sign * mine, reference, rtol=0, atol=2e-7)
 
 
-# Table 1 ----------------------------------------------------------------------------------------------------
-
-
-def test_an_area_fixed_by_the_gap_or_by_a_source_is_the_stacks_area() -> None:
-    assert build_stack(table1(gap={"a_fix": 30})).area_given == pytest.approx(30e-6, rel=1e-15)
-    assert build_stack(table1(gap={"a_fix": 0})).area_given is None
-
-
 def test_a_given_area_that_is_replaced_counts_after_the_circuit_has_run() -> None:
     text = "t\nV1 a 0 SIN(0 20 1k)\nX1 a b area LAYER d=1u eps_r=3.9 r=1meg\nX2 b 0 area SLAB d=100u eps_r=10 rho=1e4\n"
     first = fs.parse_netlist(f"{text}Varea area 0 35\n.tran 1u 1m uic\n")
@@ -193,3 +160,99 @@ def test_a_given_area_that_is_replaced_counts_after_the_circuit_has_run() -> Non
     for changed in (first.replace({"Varea": 70.0}), first.replace({"Varea.level": 70.0})):
         np.testing.assert_array_equal(fs.simulate(changed).i_source, fs.simulate(fresh).i_source)
         assert fs.phasor(changed, frequency=1e3).impedance == fs.phasor(fresh, frequency=1e3).impedance
+
+
+V = "Vdrive n0 0 SIN(0 200 100)"
+COAT = "Xcoat n0 n1 area LAYER d=1u eps_r=3.9 r=0.2meg"
+SLAB = "Xslab n1 0 area SLAB d=350u eps_r=1000 rho=1e4"
+GAP_VALUES = "GAP d=3.5u eps_r=1 fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
+GAP = f"Xgap n1 0 area {GAP_VALUES}"
+GIVEN_AREA = "Varea area 0 35"
+
+X = "LAYER d=1u eps_r=2"
+ISLAND = "is floating: nothing connects it to ground"
+REFUSALS = {
+    "area driven by nothing": ([V, COAT, SLAB], "node 'area' gives Xcoat its area, but no GAP and no DC source"),
+    "area driven twice": ([V, COAT, SLAB, GIVEN_AREA, "Vmore area 0 35"], "more than one source drives it"),
+    "area that varies": ([V, COAT, SLAB, "Varea area 0 SIN(35 1 100)"], "Varea drives an area: allowed is a DC value"),
+    "area upside down": ([V, COAT, SLAB, "Varea 0 area 35"], "Varea drives an area: allowed is a DC value"),
+    "area of zero": ([V, COAT, SLAB, "Varea area 0 0"], "Varea drives an area: allowed is a DC value above 0"),
+    "island": ([V, COAT, GAP, f"Xlost q r area {X}", f"Xmore q r area {X}"], ISLAND),
+    "no ground": ([V.replace(" 0 ", " n9 ", 1), COAT, GAP.replace("n1 0", "n1 n9")], "no element touches ground"),
+    "area node as a conductor": ([V, "Xcoat n0 area area LAYER d=1u eps_r=3.9", GAP], "is floating"),
+    "antiparallel sources": ([V, "Vsecond 0 n0 5", COAT, GAP], "Vdrive and Vsecond are voltage sources in parallel"),
+    "source loop": ([V, "Vb n0 n5 5", "Vc n5 0 5", COAT, GAP], "Vc closes a loop of voltage sources with Vdrive, Vb"),
+    "current source into nothing": (
+        ["Idrive 0 drive 1m", "Ia drive 0 2m"],
+        "Idrive is a current source without a path: node 'drive' is reached through current sources only",
+    ),
+    "area node under a resistor": ([V, COAT, GAP, "Rx area 0 1k"], "Rx and Xgap both drive the area node 'area'"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_a_topology_that_is_not_a_driven_stack_is_refused_by_name_and_with_its_place(case: str) -> None:
+    lines, message = REFUSALS[case]
+    with pytest.raises(fs.InputError) as caught:
+        deck(*lines)
+    assert message in str(caught.value)
+    if ("X" in message or "V" in message[:6]) and not message.startswith("the circuit"):
+        assert caught.value.where is not None
+        name = lines[caught.value.where.line - 2].split()[0]
+        assert name in str(caught.value), f"line {caught.value.where.line} is {name}"
+
+
+NETWORKS = {
+    "two gaps two areas": [V, f"Xone n0 n1 left {GAP_VALUES}", f"Xtwo n1 0 right {GAP_VALUES}"],
+    "resistor across": [V, COAT, GAP, "Rbody n1 0 1k"],
+    "capacitor across": [V, COAT, GAP, "Cbody n1 0 100p"],
+    "current source": ["Idrive n0 0 1u", COAT, GAP],
+    "resistor in series": [V.replace("n0", "n7"), "Rline n7 n0 1k", COAT, GAP],
+    "parallel layers": [V, COAT, GAP, "Xside n0 n1 area LAYER d=1u eps_r=2"],
+    "two loops": [V, COAT, GAP, "Vb m0 0 5", "Xb m0 0 area LAYER d=1u eps_r=2"],
+    "area with dynamics of its own": [V, COAT, GAP + " tau=1m"],
+    "no layer at all": [V, "R1 n0 n1 1k", "C1 n1 0 1n"],
+}
+
+
+@pytest.mark.parametrize("case", NETWORKS)
+def test_what_is_not_a_stack_is_a_network(case: str) -> None:
+    circuit = deck(*NETWORKS[case])
+    with pytest.raises(fs.InputError, match="needs a series chain of LAYER, SLAB, SKIN and GAP"):
+        build_stack(circuit)
+    options = {"t_stop": 1e-4, "t_eval": np.linspace(1e-5, 1e-4, 10)}
+    solution = fs.simulate(circuit, rtol=1e-6, **options)
+    exact = fs.simulate(circuit, rtol=1e-9, method="radau", **options)
+    largest = max(float(np.abs(v).max()) for v in exact.node_voltages.values())
+    assert largest > 1e-3
+    for node, v in exact.node_voltages.items():
+        assert np.abs(solution.node_voltages[node] - v).max() <= 3e-6 * largest
+
+
+def test_every_parameter_is_listed_by_path_with_value_and_unit() -> None:
+    parameters = table1().parameters
+    expected = {
+        "Vdrive.amplitude": (200.0, "V"), "Vdrive.frequency": (100.0, "Hz"), "Xcoat.eps_r": (3.9, ""),
+        "Xcoat.r": (2e5, "ohm"), "Xgap.d": (3.5e-6, "m"), "Xgap.fn": (0.5, "N"), "Xgap.alpha": (54.4, "mm^2/N^m"),
+        "Xgap.beta": (32.0, "mm^(2-n)"), "Xgap.c2": (5000.0, "mm^4/N^2"), "Xgap.a_fix": (0.0, "mm^2"),
+    }  # fmt: skip
+    assert {path: (parameters[path].value, parameters[path].unit) for path in expected} == expected
+    with pytest.raises(TypeError):
+        parameters["Xgap.d"] = 1.0  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    "source",
+    ["SIN(1 200 100 1m 3 20)", "SQUARE(200 100 0.3)", "PULSE(0 5 1m 1u 1u 2m 10m)", "EXP(0 1 1m 1m 5m 1m)", "5"],
+)
+def test_replace_changes_one_parameter_and_changing_it_back_restores_the_circuit(source: str) -> None:
+    circuit = table1(source)
+    for path, parameter in circuit.parameters.items():
+        other = 1e8 if math.isinf(parameter.value) else parameter.value * 1.01 if parameter.value else 1e-4
+        changed = circuit.replace({path: other})
+        assert changed.parameters[path].value != parameter.value
+        others = {p: v for p, v in changed.parameters.items() if p != path}
+        assert others == {p: v for p, v in circuit.parameters.items() if p != path}
+        assert changed.replace({path: parameter.value}).elements == circuit.elements
+        assert circuit.parameters[path].value == parameter.value
+        assert path in changed.overrides

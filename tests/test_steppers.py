@@ -1,7 +1,5 @@
 """Radau IIA: its coefficients, and orders of the compiled step."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

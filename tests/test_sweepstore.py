@@ -1,6 +1,4 @@
-"""Sweeps in a store: the same bytes whoever runs the chunks, and however often they are killed."""
-
-from __future__ import annotations
+"""Sweeps over grids and populations, Sobol indices, and stores: the same bytes whoever runs and kills the chunks."""
 
 import json
 import logging
@@ -21,14 +19,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy import stats
 
 import fingerspice as fs
-from commands import Command, tree
-from fingerspice.studies.sweep import chunks
+from commands import tree
+from fingerspice.studies.sweep import chunks, populations
 from fingerspice.studies.sweep.populations import Plan
 from processes import forked, no_room_here
-from scenes import CIRCUITS, cases, shipped
+from scenes import CIRCUITS, DECKS, cases, listed, shipped
 
 # How often a whole program, and a worker, is killed; each takes seconds to start.
 KILLS, KILLS_OF_WORKERS = cases(20, 2), cases(20, 1)
@@ -119,7 +118,7 @@ def killing(pids: Callable[[], list[int]], store: Path, most: int) -> Iterator[l
         thread.join()
 
 
-def test_draws_in_parts_are_those_of_the_whole(circuit: fs.Circuit) -> None:
+def test_draws_in_parts_are_those_of_the_whole(circuit):
     for count in (1 << 9, 1 << 14):
         plan = Plan(circuit, PARAMETERS, 1 << 14, 5, 1 << 30)
         plan.divide(count)
@@ -140,7 +139,7 @@ def both(circuit: fs.Circuit, asked: dict[str, Any], path: Path, **how: Any) -> 
     return memory, stored
 
 
-def test_a_store_has_what_a_sweep_in_memory_has(circuit: fs.Circuit, tmp_path: Path) -> None:
+def test_a_store_has_what_a_sweep_in_memory_has(circuit, tmp_path):
     # 3 x 5 x 1 places and 32 draws, chunks of 2 x 32: also such that reach over the edge.
     asked = {**PARAMETERS, "Xgap.r": [5e5, 6e5, 7e5, 8e5, 9e5], "Xcoat.r": [2e5]}
     how = {**HOW, "n": 32, "outputs": ("f_el_mean_periodic", "f_el_rms_periodic")}
@@ -153,7 +152,7 @@ def test_a_store_has_what_a_sweep_in_memory_has(circuit: fs.Circuit, tmp_path: P
         both(circuit, values, tmp_path / f"{len(str(values))}.zarr", **how)
 
 
-def test_a_network_and_several_fingers_go_into_a_store(tmp_path: Path) -> None:
+def test_a_network_and_several_fingers_go_into_a_store(tmp_path):
     circuit = shipped("two_fingers")
     path = next(name for name in circuit.parameters if name.endswith("ap.d"))
     how = {"outputs": ("f_el_mean",), "t_stop": 5e-3}
@@ -161,7 +160,7 @@ def test_a_network_and_several_fingers_go_into_a_store(tmp_path: Path) -> None:
     assert stored.f_el_mean.dims == (path, "gap")
 
 
-def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit: fs.Circuit, tmp_path: Path) -> None:
+def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit, tmp_path):
     # Adhesion that leaves no contact.
     asked = {"Xgap.r": [1e6, 2e6], "Xgap.c2": np.where(np.arange(80) == 70, 1e9, 5000.0)}
     how = {"outputs": ("f_el_mean",), "t_stop": 2e-2, "threads": 1}
@@ -170,7 +169,7 @@ def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit:
     assert stored.attrs["failures"] == memory.attrs["failures"]
 
 
-def test_a_single_set_of_parameters_goes_into_a_store(circuit: fs.Circuit, tmp_path: Path, command: Command) -> None:
+def test_a_single_set_of_parameters_goes_into_a_store(circuit, tmp_path, command):
     # It is number 0 of its table, and a grid of nothing but 0 is in the store, too.
     _, stored = both(circuit, {"finger": ["moist"], "Xgap.d": [3e-6, 4e-6]}, tmp_path / "s.zarr", **HOW)
     assert stored.finger.values.tolist() == ["moist"]
@@ -179,9 +178,7 @@ def test_a_single_set_of_parameters_goes_into_a_store(circuit: fs.Circuit, tmp_p
 
 
 @pytest.mark.usefixtures("_forked_workers")
-def test_workers_that_are_killed_again_and_again_cost_nothing(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
-) -> None:
+def test_workers_that_are_killed_again_and_again_cost_nothing(circuit, whole, tmp_path):
     path = tmp_path / "s.zarr"
 
     def children() -> list[int]:
@@ -217,9 +214,7 @@ class Deadly:
 
 
 @pytest.mark.usefixtures("_given_up_at_once")
-def test_chunks_that_always_cost_their_worker_end_the_sweep(
-    circuit: fs.Circuit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_that_always_cost_their_worker_end_the_sweep(circuit, tmp_path, monkeypatch):
     monkeypatch.setattr(chunks, "MOST_LOST", 1)
     with pytest.raises(fs.InputError, match=r"one chunk after another were lost, 1 times.* what is written stays"):
         fs.sweep(circuit, {"Xgap.d": Deadly()}, store=tmp_path / "s.zarr", workers=1, **{**HOW, "n": 64})
@@ -233,9 +228,7 @@ class DeadlyOnce(Deadly):
 
 
 @pytest.mark.usefixtures("_given_up_at_once")
-def test_a_chunk_that_costs_its_worker_is_named_and_the_others_are_in_the_store(
-    circuit: fs.Circuit, tmp_path: Path
-) -> None:
+def test_a_chunk_that_costs_its_worker_is_named_and_the_others_are_in_the_store(circuit, tmp_path):
     path = tmp_path / "s.zarr"
     said = r"chunk (\d) of the sweep were lost, 2 times.*; allowed: .* what is written stays"
     with pytest.raises(fs.InputError, match=said) as told:
@@ -259,9 +252,7 @@ if __name__ == "__main__":
 """
 
 
-def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
-) -> None:
+def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(circuit, whole, tmp_path):
     path, enough = tmp_path / "s.zarr", 3 * CHUNKS // 4
     (tmp_path / "script.py").write_text(SCRIPT)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
@@ -282,14 +273,12 @@ def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(
     assert tree(path) == whole
 
 
-def test_a_shard_without_chunks_does_nothing(circuit: fs.Circuit, tmp_path: Path) -> None:
+def test_a_shard_without_chunks_does_nothing(circuit, tmp_path):
     found = fs.sweep(circuit, {"Xgap.d": [3e-6, 4e-6]}, store=tmp_path / "s.zarr", shard=(3, 3), **HOW)
     assert (found.attrs["chunks"], found.attrs["chunks_found"], found.attrs["chunks_missing"]) == (0, 0, 1)
 
 
-def test_shards_by_separate_processes_make_the_whole(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
-) -> None:
+def test_shards_by_separate_processes_make_the_whole(circuit, whole, tmp_path):
     path = tmp_path / "s.zarr"
     # At once: whichever comes first creates the store.
     shards = [forked(partial(fs.sweep, circuit, PARAMETERS, store=path, shard=(i, 3), **HOW)) for i in (1, 2)]
@@ -313,9 +302,7 @@ def cluster_of(workers: int, processes: bool) -> Any:
 
 
 @pytest.mark.usefixtures("_forked_workers")
-def test_dask_workers_that_are_killed_again_and_again_cost_nothing(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_dask_workers_that_are_killed_again_and_again_cost_nothing(circuit, whole, tmp_path, monkeypatch):
     path = tmp_path / "s.zarr"
 
     def workers() -> list[int]:
@@ -333,9 +320,7 @@ def test_dask_workers_that_are_killed_again_and_again_cost_nothing(
             fs.sweep(circuit, PARAMETERS, store=tmp_path / "o.zarr", scheduler=cluster.scheduler_address, **HOW)
 
 
-def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(circuit, whole, tmp_path, monkeypatch):
     path, part, write = tmp_path / "s.zarr", Plan.draws, chunks.Work._write
     begun, written, at_once = 0, 0, 0
 
@@ -365,9 +350,7 @@ def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
     assert tree(path) == whole
 
 
-def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(
-    circuit: fs.Circuit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(circuit, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     assert chunks.PATIENCE <= 5.0
     monkeypatch.setattr(chunks, "PATIENCE", 0.5)
@@ -380,7 +363,7 @@ def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_half_written_store_of_another_sweep_is_refused_and_kept(circuit: fs.Circuit, tmp_path: Path) -> None:
+def test_a_half_written_store_of_another_sweep_is_refused_and_kept(circuit, tmp_path):
     path = tmp_path / "s.zarr"
     fs.sweep(circuit, PARAMETERS, store=path, shard=(1, 2), **HOW)
     before = tree(path)
@@ -411,9 +394,7 @@ def test_a_half_written_store_of_another_sweep_is_refused_and_kept(circuit: fs.C
     assert (path / "mine.txt").read_text() == "mine"
 
 
-def test_a_chunk_that_is_cut_short_or_not_marked_is_run_again(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
-) -> None:
+def test_a_chunk_that_is_cut_short_or_not_marked_is_run_again(circuit, whole, tmp_path):
     path = tmp_path / "s.zarr"
     copied(whole, path)
     os.truncate(path / "error" / "c" / "1" / "7", 100)
@@ -427,9 +408,7 @@ def test_a_chunk_that_is_cut_short_or_not_marked_is_run_again(
     assert tree(path) == whole
 
 
-def test_a_chunk_of_which_a_bit_has_changed_is_run_again(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, command: Command
-) -> None:
+def test_a_chunk_of_which_a_bit_has_changed_is_run_again(circuit, whole, tmp_path, command):
     path, rng = tmp_path / "s.zarr", np.random.default_rng(5)
     copied(whole, path)
     assert "chunks of 6 arrays are as they were written" in command("check", str(path)).out
@@ -450,52 +429,39 @@ def test_a_chunk_of_which_a_bit_has_changed_is_run_again(
 @pytest.mark.parametrize(
     ("parameters", "how", "said"),
     [
-        ({}, {"shard": (0, 3)}, "shard is"),
-        ({}, {"shard": (4, 3)}, "shard is"),
-        ({}, {"workers": 0}, "workers is 0"),
-        ({}, {"workers": 2, "scheduler": "tcp://127.0.0.1:1"}, "both given"),
-        ({}, {"outputs": ("f_el_mean", "u_gap")}, "u_gap"),
-        ({}, {"outputs": ("force",)}, "unknown output"),
-        ({}, {"n": 1 << 31}, r"at most 2\^30"),
+        *listed("stored_sweeps"),
         ({"Xgap.d": stats.norm(1e-6, 1e-6)}, {}, r"the distribution of Xgap\.d"),
-        ({"Xgap.d": [1e-6, -1e-6]}, {}, r"the values of Xgap\.d"),
-        ({"Xgap.dd": 1e-6}, {}, "Xgap.d"),
         *(
             ({}, {"store": None, **how}, "without store")
             for how in ({"workers": 2}, {"scheduler": "a"}, {"shard": (1, 2)})
         ),
     ],
 )
-def test_bad_requests_are_refused_before_anything_is_written(
-    circuit: fs.Circuit, parameters: Any, how: dict[str, Any], said: str, tmp_path: Path
-) -> None:
+def test_bad_requests_are_refused_before_anything_is_written(circuit, parameters, how, said, tmp_path):
     with pytest.raises(fs.InputError, match=said) as told:
         fs.sweep(circuit, {**PARAMETERS, **parameters}, **{"store": tmp_path / "s.zarr", **HOW, **how})
     assert "\n" not in str(told.value)
     assert not list(tmp_path.iterdir())
 
 
-FILE = """deck = "fingerpad.cir"
-n = 64
-seed = 1
-outputs = ["f_el_mean_periodic"]
-periodic = true
-[parameters]
-"source.frequency" = { log = [20, 2000, 6] }
-"Xgap.d" = { lognormal = [3.5e-6, 0.1] }
-"""
+FILE, SMALL = ((DECKS / name).read_text() for name in ("fingers.toml", "fingers_with_indices.toml"))
+
+
+def described(folder: Path, text: str) -> Path:
+    """The file of a sweep beside its deck."""
+    for name in ("fingerpad.cir", "fingerspice.lib"):
+        (folder / name).write_bytes((CIRCUITS / name).read_bytes())
+    (folder / "fingers.toml").write_text(text)
+    return folder / "fingers.toml"
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    for name in ("fingerpad.cir", "fingerspice.lib"):
-        (tmp_path / name).write_bytes((CIRCUITS / name).read_bytes())
-    (tmp_path / "fingers.toml").write_text(FILE)
-    return tmp_path / "fingers.toml"
+    return described(tmp_path, FILE)
 
 
 @pytest.mark.usefixtures("_forked_workers")
-def test_the_command_fills_a_store_shard_by_shard(file: Path, command: Command) -> None:
+def test_the_command_fills_a_store_shard_by_shard(file, command):
     store = file.parent / "o.zarr"
     words = ("sweep", str(file), "--store", str(store))
     first = command(*words, "--shard", "1/2", "--json")
@@ -521,19 +487,8 @@ def test_the_command_fills_a_store_shard_by_shard(file: Path, command: Command) 
     assert "median" in command(*words).out
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--workers", "2"), "--workers is given without --store"),
-        (("--shard", "1/2"), "--shard is given without --store"),
-        (("--store", "o.zarr", "--shard", "1-2"), "two whole numbers such as 1/8"),
-        (("--store", "o.zarr", "--shard", "3/2"), "shard is (3, 2)"),
-        (("--store", "fingers.toml"), "is no store of a sweep"),
-    ],
-)
-def test_bad_commands_are_refused_in_one_sentence(
-    file: Path, command: Command, words: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(("words", "said"), listed("sweep_commands"))
+def test_bad_commands_are_refused_in_one_sentence(file, command, words, said, monkeypatch):
     monkeypatch.chdir(file.parent)
     before = tree(file.parent)
     done = command("sweep", str(file), *words)
@@ -543,9 +498,7 @@ def test_bad_commands_are_refused_in_one_sentence(
     assert tree(file.parent) == before
 
 
-def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(
-    file: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(file, command, monkeypatch):
     monkeypatch.chdir(file.parent)
     words = ("sweep", str(file), "--store", "o.zarr")
     monkeypatch.setattr(chunks, "CHUNK", CHUNK)
@@ -558,3 +511,159 @@ def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(
     again = command(*words)
     assert again.code == 0
     assert all(line.startswith("fingerspice: warning") for line in again.lines)
+
+
+SWEPT = {"periodic": True, "outputs": ("f_el_mean_periodic",), "rtol": 1e-4}
+
+
+def test_a_grid_has_a_dimension_for_each_array(circuit):
+    gaps, loads = [3e-6, 3.5e-6, 4e-6], [0.3, 0.5]
+    found = fs.sweep(circuit, {"xgap.D": gaps, "Xgap.fn": loads}, **SWEPT)
+    assert found.f_el_mean_periodic.dims == ("Xgap.d", "Xgap.fn")
+    for i, d in enumerate(gaps):
+        for j, load in enumerate(loads):
+            mean = fs.steady_state(circuit.replace({"Xgap.d": d, "Xgap.fn": load}), rtol=1e-6).solution.f_el_mean
+            assert float(found.f_el_mean_periodic[i, j]) == pytest.approx(mean, rel=2e-4)
+
+
+def test_a_population_is_the_same_at_every_place_and_for_every_seed(circuit):
+    law = stats.lognorm(0.1, scale=3.5e-6)
+    asked: dict[str, Any] = {"source.frequency": [100.0, 1000.0], "Xgap.d": law}
+    found, again, other = (fs.sweep(circuit, asked, n=64, seed=seed, **SWEPT) for seed in (3, 3, 4))
+    xr.testing.assert_identical(found, again)
+    assert not np.array_equal(found["Xgap.d"], other["Xgap.d"])
+    assert found.f_el_mean_periodic.dims == ("Vdrive.frequency", "scene")
+    # Sobol points: one in each of 64 equal parts of the distribution.
+    np.testing.assert_array_equal(np.sort(np.floor(64.0 * law.cdf(found["Xgap.d"].values))), np.arange(64))
+    alone = fs.sweep(circuit.replace({"Vdrive.frequency": 1000.0}), {"Xgap.d": law}, n=64, seed=3, **SWEPT)
+    np.testing.assert_array_equal(alone.f_el_mean_periodic, found.f_el_mean_periodic[1])
+
+
+def test_indices_are_those_of_the_ishigami_function(circuit, monkeypatch):
+    def function(x: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sin(x[0]) + 7.0 * np.sin(x[1]) ** 2 + 0.1 * x[2] ** 4 * np.sin(x[0]))
+
+    def ishigami(_circuit: fs.Circuit, scenes: Any, **_options: Any) -> xr.Dataset:
+        value = function(np.array([scenes[path] for path in ("Xgap.d", "Xgap.r", "Xskin.d")]))
+        status = np.zeros(value.size, np.int8)
+        return xr.Dataset({"f_el_mean": ("scene", value), "status": ("scene", status)}, attrs={"failures": []})
+
+    monkeypatch.setattr(populations, "batch", ishigami)
+    law = stats.uniform(-np.pi, 2.0 * np.pi)
+    found = fs.sobol(circuit, dict.fromkeys(("Xgap.d", "Xgap.r", "Xskin.d"), law), n=4096)
+    # Ishigami and Homma 1990, a = 7, b = 0.1.
+    first, total = [0.3139, 0.4424, 0.0], [0.5576, 0.4424, 0.2437]
+    np.testing.assert_allclose(found.f_el_mean_first, first, atol=0.02)
+    np.testing.assert_allclose(found.f_el_mean_total, total, atol=0.02)
+    for kind, exact in (("first", first), ("total", total)):
+        assert np.all(found[f"f_el_mean_{kind}_low"] <= np.array(exact) + 0.01)
+        assert np.all(found[f"f_el_mean_{kind}_high"] >= np.array(exact) - 0.01)
+    theirs = stats.sobol_indices(func=function, n=4096, dists=[law] * 3, rng=0)
+    np.testing.assert_allclose(found.f_el_mean_first, theirs.first_order, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.f_el_mean_total, theirs.total_order, rtol=0, atol=1e-12)
+    assert np.all(found.f_el_mean_first_low <= found.f_el_mean_first)
+    assert np.all(found.f_el_mean_first_high >= found.f_el_mean_first)
+    assert float(found.f_el_mean_mean) == pytest.approx(3.5, abs=0.05)
+    rows = populations.ranking(found, "f_el_mean")
+    assert [row["parameter"] for row in rows] == ["Xgap.d", "Xgap.r", "Xskin.d"]
+    assert all(row["low"] <= row["total"] <= row["high"] for row in rows)
+
+
+def test_one_parameter_alone_has_the_whole_variance(circuit):
+    found = fs.sobol(circuit, {"Xgap.d": stats.lognorm(0.1, scale=3.5e-6)}, n=64, skin="follow", **SWEPT)
+    for kind in ("first", "total"):
+        np.testing.assert_allclose(found[f"f_el_mean_periodic_{kind}"], [1.0], atol=0.05)
+
+
+def test_what_matters_to_the_force_is_named_at_every_place(circuit):
+    asked = {
+        "source.frequency": [100.0, 5000.0], "Xgap.d": stats.lognorm(0.1, scale=3.5e-6),
+        "Xcoat.r": stats.lognorm(1e-3, scale=2e5),
+    }  # fmt: skip
+    found = fs.sobol(circuit, asked, n=64, skin="follow", **SWEPT)
+    assert found.f_el_mean_periodic_total.dims == ("Vdrive.frequency", "parameter")
+    # A resistance that hardly varies hardly matters.
+    assert np.all(found.f_el_mean_periodic_total.sel(parameter="Xgap.d") > 0.95)
+    assert np.all(found.f_el_mean_periodic_total.sel(parameter="Xcoat.r") < 0.05)
+    rows = populations.ranking(found, "f_el_mean_periodic")
+    assert [(row["place"]["Vdrive.frequency"], row["parameter"]) for row in rows] == [
+        (100.0, "Xgap.d"), (100.0, "Xcoat.r"), (5000.0, "Xgap.d"), (5000.0, "Xcoat.r")
+    ]  # fmt: skip
+    # One parameter at a quantile and the other at its median is a scene like any other.
+    place = {
+        "Vdrive.frequency": 5000.0,
+        "Xgap.d": float(found["at"].sel(parameter="Xgap.d", quantile=0.95)),
+        "Xcoat.r": 2e5,
+    }
+    alone = fs.batch(circuit, place, skin="follow", **SWEPT).f_el_mean_periodic
+    assert float(found.f_el_mean_periodic_alone.sel(parameter="Xgap.d", quantile=0.95)[1]) == float(alone[0])
+
+
+def test_several_paths_are_scaled_together(circuit):
+    both = fs.sweep(circuit, {"Xgap.alpha, xgap.beta": [0.8, 1.2], "Xgap.fn": 0.3}, **SWEPT)
+    assert both.f_el_mean_periodic.dims == ("Xgap.alpha,Xgap.beta",)
+    for i, factor in enumerate((0.8, 1.2)):
+        scaled = {path: factor * circuit.parameters[path].value for path in ("Xgap.alpha", "Xgap.beta")}
+        mean = fs.steady_state(circuit.replace({**scaled, "Xgap.fn": 0.3}), rtol=1e-6).solution.f_el_mean
+        assert float(both.f_el_mean_periodic[i]) == pytest.approx(mean, rel=2e-4)
+    with pytest.raises(fs.InputError, match=r"Xgap\.alpha is given twice"):
+        fs.sweep(circuit, {"Xgap.alpha, Xgap.beta": [0.8], "Xgap.alpha": 54.4}, **SWEPT)
+
+
+def test_the_shipped_sweep_of_fig_3_says_what_matters_where(tmp_path, command):
+    done = command("sweep", str(CIRCUITS / "fig3.toml"), "--out", str(tmp_path), "--json")
+    assert done.code == 0, done.err
+    shares: dict[float, dict[str, float]] = {}
+    for row in json.loads(done.out)["shares"]:
+        shares.setdefault(row["place"]["Vdrive.frequency"], {})[row["parameter"]] = row["total"]
+    slow, fast = shares[10.0], shares[10000.0]
+    # Section 4 of the paper: the gap's thickness matters at all frequencies, its resistance at low ones, and the area
+    # more than the skin's thickness.
+    assert all(max(one, key=one.__getitem__) == "Xgap.d" for one in shares.values())
+    assert slow["Xgap.r"] > 0.25
+    assert fast["Xgap.r"] < 0.01
+    assert all(one["Xgap.alpha,Xgap.beta"] > 3.0 * one["Xskin.d"] for one in shares.values())
+    with xr.open_dataset(tmp_path / "fig3.nc", engine="h5netcdf") as kept:
+        assert kept.f_el_mean_periodic.dims == ("Vdrive.frequency", "scene")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "how", "said"),
+    [
+        *listed("sweeps"),
+        ({"Xgap.d": stats.norm(1e-6, 1e-6)}, {}, "in scene"),
+        ({"Xgap.d": stats.lognorm(0.1, scale=3e-6)}, {"n": 1000}, "a power of two"),
+    ],
+)
+def test_bad_sweeps_are_refused_in_one_sentence(circuit, parameters, how, said):
+    with pytest.raises(fs.InputError, match=said) as told:
+        fs.sweep(circuit, parameters, **how)
+    assert "\n" not in str(told.value)
+    if not any(hasattr(value, "ppf") for value in parameters.values()):
+        with pytest.raises(fs.InputError):
+            fs.sobol(circuit, parameters, **how)
+
+
+def test_the_command_writes_scenes_indices_and_a_picture(tmp_path, command):
+    file = str(described(tmp_path, SMALL))
+    done = command("sweep", file, "--out", str(tmp_path / "o"), "--json")
+    answer = json.loads(done.out)
+    assert done.code == 0, done.err
+    assert (answer["scenes"], answer["failed"], answer["n"]) == (32, 0, 32)
+    assert answer["figures"][0]["p5"] < answer["figures"][0]["median"] < answer["figures"][0]["p95"]
+    assert answer["shares"][0]["parameter"] == "Xgap.d"
+    with xr.open_dataset(tmp_path / "o" / "fingers.nc", engine="h5netcdf") as kept:
+        assert kept.f_el_mean_periodic.shape == (32,)
+        assert kept.f_el_mean_periodic_total.shape == (2,)
+    assert (tmp_path / "o" / "fingers.png").stat().st_size > 10_000
+    # Of the same deck: replaced without a question.
+    assert command("sweep", file, "--out", str(tmp_path / "o"), "--no-plot").code == 0
+
+
+@pytest.mark.parametrize(("change", "said"), listed("sweep_files"))
+def test_bad_files_are_refused_in_one_sentence(tmp_path, command, change, said):
+    done = command("sweep", str(described(tmp_path, SMALL.replace(*change))), "--out", str(tmp_path / "o"))
+    assert done.code == 2
+    assert said in done.err
+    assert "Traceback" not in done.err
+    assert not (tmp_path / "o").exists()

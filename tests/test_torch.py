@@ -1,7 +1,5 @@
 """`fs.torch.Simulator`: derivatives against differences and torchdiffeq, every way of torch to them, shapes, errors."""
 
-from __future__ import annotations
-
 import copy
 import runpy
 import subprocess
@@ -15,7 +13,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.base.errors import InputError
-from scenes import cases, every_law, shipped, table1
+from scenes import cases, listed, shipped, table1
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install '.[test]'")
 
@@ -58,9 +56,7 @@ def means() -> Any:
     ids=["runs", "batch"],
 )
 @pytest.mark.parametrize("periodic", [False, True])
-def test_gradcheck_backward_and_forward(
-    shares: Any, periodic: bool, outputs: tuple[str, ...], how: dict[str, Any]
-) -> None:
+def test_gradcheck_backward_and_forward(shares, periodic, outputs, how):
     run = by_shares(fs.torch.Simulator(table1(), (), outputs, periodic=periodic, rtol=1e-9, **how))
     batched = "t" in how
     shares = shares[:1] if batched else shares
@@ -96,41 +92,6 @@ def test_vmap_over_some_of_the_values_only() -> None:
     thickness = torch.tensor([3e-6, 3.5e-6, 4e-6], dtype=torch.float64)
     mapped = torch.func.vmap(lambda d: simulator({"Xgap.d": d, "Vdrive.amplitude": 150.0}))(thickness)
     assert torch.equal(mapped, simulator({"Xgap.d": thickness, "Vdrive.amplitude": 150.0}))
-
-
-@every_law
-def test_values_and_derivatives_are_those_of_differences_of_runs(law: str) -> None:
-    circuit = table1(library="fingerspice.lib" if law == "local" else "fingerspice_mobile.lib")
-    paths, step = ("Xcoat.r", "Xgap.m_exp", "Vdrive.frequency"), 2e-4
-    simulator = fs.torch.Simulator(circuit, paths, ("f_t", "f_el_mean"), t=TIMES, t_stop=T_STOP, rtol=1e-10)
-    found = simulator()
-    run = fs.simulate(circuit, t_eval=TIMES, t_stop=T_STOP, rtol=1e-12)
-    np.testing.assert_allclose(found["f_t"].detach().numpy(), run.f_t, rtol=1e-9)
-    assert float(found["f_el_mean"].detach()) == pytest.approx(run.f_el_mean, rel=1e-9)
-    (2.0 * found["f_el_mean"] - found["f_t"][1]).backward()
-    for path in paths:
-        value, expected = circuit.parameters[path].value, 0.0
-        for k, weight in {-2: 1.0, -1: -8.0, 1: 8.0, 2: -1.0}.items():
-            moved = circuit.replace({path: value * (1.0 + k * step)})
-            run = fs.simulate(moved, t_eval=TIMES, t_stop=T_STOP, rtol=1e-12)
-            expected += weight * (2.0 * run.f_el_mean - run.f_t[1]) / (12.0 * step * value)
-        grad = getattr(simulator, path.replace(".", "_")).grad
-        assert float(grad) * value == pytest.approx(expected * value, abs=2e-9), path
-
-
-def test_points_at_uneven_times_have_derivatives() -> None:
-    # Two steps of time in turn: with every other point alone, on the same lines, the times are even.
-    t = np.linspace(0.0, T_STOP, 601)
-    v, times = 150.0 * np.sin(2.0 * np.pi * 150.0 * t), np.sort(np.append(t, t[:-1] + 0.3 * np.diff(t)))
-    found = []
-    for source in (fs.PWL(times, np.interp(times, t, v)), fs.PWL(t, v)):
-        simulator = fs.torch.Simulator(
-            table1().replace({"Vdrive": source}), ("Xgap.d",), ("u_gap", "f_el_mean"), t=TIMES, t_stop=T_STOP, rtol=1e-7
-        )
-        out = simulator()
-        (out["f_el_mean"] + out["u_gap"].sum()).backward()
-        found.append(float(simulator.Xgap_d.grad) * 3.5e-6)
-    assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
 # The last is the first by another way to the derivatives in torchdiffeq.
@@ -237,23 +198,7 @@ def test_no_warning_about_values_that_an_optimiser_chooses() -> None:
         fs.torch.Simulator(table1(), {"Xgap.d": 0.1}, "u_gap", t=TIMES, t_stop=T_STOP)()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "how", "text"),
-    [
-        ((("Xgap.dd",),), {}, "nearest: 'Xgap.d'"),
-        (("Xgap.d",), {}, r"parameters is 'Xgap.d'; allowed: a sequence of paths"),
-        ((("Xgap.d", "xgap.d"),), {}, "Xgap.d is given twice"),
-        (({"Xgap.d": "thick"},), {}, "Xgap.d is 'thick'; allowed"),
-        (({"Xgap.d": -1e-6},), {"logarithms": True}, "Xgap.d is -1e-06, and logarithms are asked for"),
-        (((), "u_skin"), {}, "unknown output 'u_skin'; allowed: f_el_mean"),
-        (((), ()), {}, "outputs is empty"),
-        (((), ("f_el_mean", "f_el_mean")), {}, "every name once"),
-        (((), "u_gap"), {}, "u_gap is asked for, and t is None"),
-        (((), "f_el_mean"), {"t": [0.0]}, "t is given, and no signal is asked for"),
-        (((), "f_el_mean"), {"t_stop": -1.0}, "t_stop is -1 s; allowed: a number of s, > 0"),
-        (((), "f_el_mean"), {"rtol": 1e-13}, "rtol is 1e-13; allowed"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "how", "text"), listed("simulators"))
 def test_refused_when_it_is_made(arguments: tuple[Any, ...], how: dict[str, Any], text: str) -> None:
     with pytest.raises(InputError, match=text):
         fs.torch.Simulator(table1(), *arguments, **how)
@@ -262,13 +207,9 @@ def test_refused_when_it_is_made(arguments: tuple[Any, ...], how: dict[str, Any]
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({}, "there are no values"),
-        ({"Xgap.e": 1.0}, "unknown parameter 'Xgap.e'"),
-        ({"Xgap.d": -1e-6}, r"Xgap.d is -1e-06 in scene 0; allowed"),
-        ({"Xgap.d": [3e-6, 4e-6], "Xgap.r": [1e6, 1e6, 1e6]}, r"shapes \(2,\) \(Xgap.d\), \(3,\) \(Xgap.r\); allowed"),
+        *listed("scenes_of_simulators"),
         ({"Xgap.d": 3e-6 + 1j}, "Xgap.d is .*; allowed: a tensor or array of numbers"),
         ({"Xgap.d": torch.tensor(1j)}, "Xgap.d is a tensor of torch.complex64; allowed: real numbers"),
-        ({"Xgap.mu": [0.3, 50.0]}, "1 of 2 scenes cannot be run; scene 1: .*no contact"),
     ],
 )
 def test_refused_when_it_is_called(values: dict[str, Any], text: str) -> None:
@@ -355,25 +296,6 @@ def test_several_drives_are_runs_of_their_own() -> None:
         run = fs.simulate(table1(), sources=fs.Samples(row, 20e3), t_stop=9e-3, t_eval=[9e-3], charge=False)
         assert force[i].item() == run.f_el_mean
         np.testing.assert_array_equal(drive.samples.grad[i], run.sample_gradient(f_el_mean=1.0).values)
-
-
-def test_a_drive_is_learned() -> None:
-    # The friction of another drive is met by the gradient alone.
-    t = np.linspace(2e-3, 9.5e-3, 40)
-    how = {"t": t, "t_stop": 9.9e-3, "outputs": "friction", "rtol": 1e-8}
-    goal = fs.torch.Drive(table1(), samples_of(), 20e3, **how)().detach()
-    drive = fs.torch.Drive(table1(), 0.0 * samples_of() + 70.0, 20e3, **how)
-    optimizer = torch.optim.LBFGS(drive.parameters(), max_iter=30, line_search_fn="strong_wolfe")
-    first = (drive() - goal).square().sum().item()
-
-    def misfit() -> torch.Tensor:
-        optimizer.zero_grad()
-        loss = 1e4 * (drive() - goal).square().sum()
-        loss.backward()
-        return loss
-
-    optimizer.step(misfit)
-    assert (drive() - goal).square().sum().item() < 1e-3 * first
 
 
 def test_a_drive_that_cannot_be_run_is_named() -> None:

@@ -5,8 +5,6 @@ contact's constants, which are in mm and N as in the netlist. The values are ten
 them. Derivatives come from autograd through the solver's steps, or from its adjoint equation.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 

@@ -1,7 +1,5 @@
 """Every waveform class with an independent formula: the registry over which tests iterate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
