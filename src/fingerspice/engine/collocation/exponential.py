@@ -33,7 +33,7 @@ def respond(forcing: FloatArray, phi: FloatArray, base: FloatArray, w: FloatArra
 
 
 # The nonlinear term of a circuit in a run at the modes of the step at hand, False beyond a fold; and at other modes,
-# with both as rows of `work.spare`.
+# with both as rows of `Modal.spare`.
 _evaluate = jit_by_kind(OneArea=evaluate_one, ManyAreas=evaluate_many)
 _probe = jit_by_kind(OneArea=probe_one, ManyAreas=probe_many)
 

@@ -2,6 +2,9 @@
 
 What a step consists of depends on the circuit: a stack has one area and one source (`engine.one_area.step`), a network
 any number of both (`engine.many_areas.step`). The first functions below stand for those of the circuit at hand.
+
+The loop is not inlined, nor is what begins a step of a network (`jit`): all in one function would take the compiler
+much longer. What an inlined function calls is inlined with it, even where it does not say so.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import borrow, jit, jit_by_kind, jit_within
+from fingerspice.base.compiled import borrow, jit, jit_by_kind
 from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.readout import LoopState
 from fingerspice.engine.collocation.step_control import NOT_FRESH, Pace, accept, allowed_factor, rung, shorten
@@ -58,7 +61,7 @@ def no_looks() -> Looks:
     return Looks(values, np.zeros(0), np.zeros(0))
 
 
-@jit_within
+@jit
 def next_stop(looks: Looks, edges: FloatArray, t_end: float) -> float:
     """Time (s) of the next look or trial, or the edge of the sources that differs from it by rounding only."""
     v = looks.values
@@ -70,7 +73,7 @@ def next_stop(looks: Looks, edges: FloatArray, t_end: float) -> float:
     return min(t, t_end)
 
 
-@jit_within
+@jit
 def look(looks: Looks, s: LoopState) -> bool:
     """Compare the state with that of the last look; True if the caller has something to do.
 
@@ -124,7 +127,7 @@ _start, _begin, _attempt, _refuse, _beyond, _complete, _end = (
 )
 
 
-@jit_within
+@jit
 def worst(peaks: FloatArray) -> float:
     """Largest ratio of the estimated error to the peak so far, over the voltages and forces of all gaps."""
     found, largest = 0.0, 0.0
@@ -161,7 +164,7 @@ def march_on(circuit: Circuit, pace: Pace, state: LoopState, looks: Looks, t_end
             return readout.DONE
 
 
-@jit_within
+@jit
 def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
     """Step to `t_end` (s; not past the last edge of the sources), writing outputs on the way.
 
@@ -183,7 +186,7 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
             return code
 
 
-@jit_within
+@jit
 def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
     """Solve a step with ever shorter lengths until its error is small enough, and choose the next step's length."""
     step, control, counters = state.step[0], state.control[0], state.counters

@@ -181,7 +181,7 @@ def combine(matrix: FloatArray, rows: FloatArray, out: FloatArray) -> None:
 
 @jit_rows
 def multiply(matrix: FloatArray, rows: FloatArray, start: FloatArray | None, out: FloatArray) -> None:
-    """out = matrix @ rows, more than `start` if that is given, at all rows of a step."""
+    """out = matrix @ rows, and `start` if that is given, at all rows of a step."""
     for c in range(matrix.shape[0]):
         for i in range(ROWS):
             out[c, i] = 0.0 if start is None else start[c, i]

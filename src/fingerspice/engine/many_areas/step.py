@@ -111,7 +111,7 @@ def branch_of(c: ManyAreas, s: LoopState) -> FloatArray:
     return c.work.jump.branch if s.step[0].in_jump > 0 else c.branch
 
 
-@jit_within
+@jit
 def start(c: ManyAreas, s: LoopState) -> None:
     """Begin a call of the loop, or go on after a pause, which changes nothing."""
     form, work, step, counters = c.form, c.work, s.step[0], s.counters
@@ -137,7 +137,7 @@ def start(c: ManyAreas, s: LoopState) -> None:
         work.size[k] = form.size[k] if k < n else c.u_scale
 
 
-@jit_within
+@jit
 def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
     """Where the next step starts: at an edge of a source, within a jump, or later; and its length."""
     form, work, step, control, counters = c.form, c.work, s.step[0], s.control[0], s.counters
@@ -174,7 +174,7 @@ def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
     return readout.GO_ON
 
 
-@jit_within
+@jit
 def _look_at_sources(c: ManyAreas, s: LoopState, t_end: float) -> None:
     """The sources' segments and values at the present time, and the next edge; a jump of any of them is entered."""
     work, step, sources, before, t = c.work, s.step[0], c.sources, c.s_before, s.control[0].t
@@ -198,7 +198,7 @@ def _look_at_sources(c: ManyAreas, s: LoopState, t_end: float) -> None:
         _enter_jump(c, s)
 
 
-@jit_within
+@jit
 def _enter_jump(c: ManyAreas, s: LoopState) -> None:
     """Go on in the fraction of a jump from the sources' values before it to those now."""
     jump, step, control = c.work.jump, s.step[0], s.control[0]
@@ -214,7 +214,7 @@ def _enter_jump(c: ManyAreas, s: LoopState) -> None:
     copy_to(c.work.now, jump.before)
 
 
-@jit_within
+@jit
 def _leave_jump(c: ManyAreas, s: LoopState) -> None:
     """Go on in time after a jump."""
     jump = c.work.jump
@@ -226,7 +226,7 @@ def _leave_jump(c: ManyAreas, s: LoopState) -> None:
     s.step[0].tabled = 0.0
 
 
-@jit_within
+@jit
 def resume_time(c: ManyAreas, s: LoopState) -> None:
     """Take the bookkeeping of before a jump, with the errors that the jump has added."""
     jump, control = c.work.jump, s.control[0]
@@ -235,7 +235,7 @@ def resume_time(c: ManyAreas, s: LoopState) -> None:
     s.step[0].in_jump = 0
 
 
-@jit_within
+@jit
 def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
     """The areas at the start of a step and, where it is not known yet, the branch of each; the next zero to expect."""
     form, work, control, sign = c.form, c.work, s.control[0], c.sign
@@ -261,7 +261,7 @@ def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
             control.branch_start, control.branch_length = branch[a, 0], branch[a, 1]
 
 
-@jit_within
+@jit
 def _take_reference(c: ManyAreas, s: LoopState) -> bool:
     """Go over to the reference nearest to the present areas, with the error; False if it has not been made yet."""
     form, work, x = c.form, c.work, c.work.modal.w0
@@ -329,7 +329,7 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     return readout.GO_ON
 
 
-@jit_within
+@jit
 def refuse(c: ManyAreas, s: LoopState) -> int:
     """Why no shorter step would do after one that was rejected; GO_ON if one may."""
     step, t = s.step[0], s.control[0].t
@@ -343,7 +343,7 @@ def refuse(c: ManyAreas, s: LoopState) -> int:
     return readout.NO_STEP if stuck or lost or (step.whole > 0 and 1.0 / step.grown < _NEAR_FOLD) else readout.GO_ON
 
 
-@jit_within
+@jit
 def beyond(c: ManyAreas, pace: Pace, s: LoopState) -> float:
     """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
 
@@ -411,7 +411,7 @@ def _cut_at_zero(c: ManyAreas, pace: Pace, s: LoopState, later: bool) -> None:
                 step.crossed, step.theta, step.t_new = a, crossing, reached
 
 
-@jit_within
+@jit
 def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
     """Inverse distance of a step to the fold with all modes, also those that the step takes for stiff.
 
@@ -488,7 +488,7 @@ def _cross(c: ManyAreas, s: LoopState, a: int) -> None:
     s.step[0].fresh = step_control.AFTER_ZERO
 
 
-@jit_within
+@jit
 def end(c: ManyAreas, s: LoopState) -> None:
     """End a call of the loop: if it stopped within a jump, the time is that of the jump."""
     if s.step[0].in_jump > 0:
