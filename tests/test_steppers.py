@@ -10,10 +10,10 @@ import pytest
 
 import fingerspice as fs
 from analytic import sine_segments, transient
-from fingerspice.engine.implicit import dense_polynomial, dense_state, guess, linearise, step
+from fingerspice.engine.implicit import dense_polynomial, dense_state, guess, linearise, radau_scheme, step
 from fingerspice.engine.network import rates
 from fingerspice.numerics.lobatto import Tableau, radau
-from fingerspice.solve.nodal import STAGES, STAGES_BESIDE, Collocation, radau_scheme
+from fingerspice.solve.nodal import STAGES, STAGES_BESIDE, Collocation
 from fingerspice.solve.problem import Tables, joined, prepare, values_at
 from scenes import every_law, table1
 
