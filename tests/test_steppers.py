@@ -86,7 +86,7 @@ def one_step(stages: int, law: str, h: float) -> np.ndarray:
     one = Collocation(problem, scheme, 1e-14, U0)
     (tables,) = Tables(problem, 1e-14)
     sources = joined(tables)
-    assert one.jump(values_at(sources, 0.0))
+    assert one.jump(values_at(sources, 0.0)[0])
     one.room.s[:], one.room.ds[:] = one.s_before, (U0 * 2.0 * math.pi * F * math.cos(math.radians(PHASE)),)
     assert rates(one.net, one.room, False, one.y, one.sign, one.work.rate)
     start = one.work.rate.copy()

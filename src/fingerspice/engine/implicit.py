@@ -352,48 +352,30 @@ def _look(c: Nodal, t: float, h: float, theta: float, y: FloatArray) -> None:
 def _first_zero(c: Nodal, t: float, h: float, y: FloatArray) -> tuple[float, int]:
     """First fraction of the step at which a gap voltage leaves its branch, and the index of its area; 2 and -1 if none.
 
-    Each gap voltage is sampled at the eighths of the step, and its sign change found by regula falsi.
+    Each gap voltage is sampled at the eighths of the step, and its sign change found by bisection.
     """
-    first = 2.0
-    which = -1
+    first, which = 2.0, -1
     for i in range(c.sign.size):
         if c.net.gap[i] < 0:
             continue
-        lo = 0.0
-        f_lo = _signed(c, i, t, h, 0.0, y)
-        hi = 0.0
-        f_hi = 0.0
+        lo, f_lo = 0.0, _signed(c, i, t, h, 0.0, y)
+        hi, f_hi = 0.0, 0.0
         for part in range(1, 9):
             hi = 0.125 * part
             f_hi = _signed(c, i, t, h, hi, y)
             if f_hi < 0.0:
                 break
-            lo = hi
-            f_lo = f_hi
+            lo, f_lo = hi, f_hi
         if not f_hi < 0.0 or lo >= first:
             continue
-        if f_lo > 0.0:
-            for _ in range(100):
-                mid = (lo * f_hi - hi * f_lo) / (f_hi - f_lo)
-                if not lo < mid < hi:
-                    mid = 0.5 * (lo + hi)
-                if not lo < mid < hi:
-                    break
-                f_mid = _signed(c, i, t, h, mid, y)
-                # Illinois variant of regula falsi: the value at the end that stays is halved.
-                if f_mid < 0.0:
-                    hi = mid
-                    f_hi = f_mid
-                    f_lo *= 0.5
-                else:
-                    lo = mid
-                    f_lo = f_mid
-                    f_hi *= 0.5
-                if hi - lo <= 4e-16 or f_mid == 0.0:
-                    break
+        while f_lo > 0.0 and hi - lo > 4e-16:
+            middle = 0.5 * (lo + hi)
+            if _signed(c, i, t, h, middle, y) < 0.0:
+                hi = middle
+            else:
+                lo = middle
         if hi < first:
-            first = hi if f_lo > 0.0 else lo
-            which = i
+            first, which = hi if f_lo > 0.0 else lo, i
     return first, which
 
 
