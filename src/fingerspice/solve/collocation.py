@@ -149,8 +149,9 @@ class Track(Stepping):
         return super().failed(code, sources)
 
     def state(self) -> State:
-        before, sign, u_gap = (float(self.control[name]) for name in ("u_before", "sign", "u_gap"))
-        u_gap = gap_at(self.system.model, self.y, before, sign or 1.0, u_gap)
+        model, before, u_gap = self.system.model, float(self.control["u_before"]), float(self.control["u_gap"])
+        if model.mobile:
+            u_gap = gap_at(model, self.y, before, float(self.control["sign"]) or 1.0, u_gap)
         return from_loop(self.problem.scene, self.t, self.y, before, u_gap)
 
     def jump(self, after: FloatArray) -> bool:

@@ -364,13 +364,15 @@ def values_at(sources: Sources, t: float, side: Literal["left", "right"] = "righ
 
 def after_the_end(problem: Problem) -> Sources | None:
     """The sources from the end of a run on, where one of them may jump there; else None."""
-    stop = problem.t_stop
-    if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
-        return None
+    stop, step = problem.t_stop, problem.step
 
-    key, step = ("after", stop, problem.step), problem.step
-    tables = (source_table(w, stop, stop + step, 1e-10, step) for w in problem.waveforms)
-    return kept_with(problem.waveform.kept, key, 1, lambda: joined(list(tables)))
+    def make() -> tuple[Sources, ...]:
+        if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
+            return ()
+        return (joined([source_table(w, stop, stop + step, 1e-10, step) for w in problem.waveforms]),)
+
+    found = kept_with(problem.waveform.kept, ("after", stop, step), 1, make)
+    return found[0] if found else None
 
 
 def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) -> IntArray:
