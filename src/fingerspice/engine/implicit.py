@@ -6,15 +6,17 @@ A step is solved by simplified Newton iterations in the eigenvectors of the tabl
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import ComplexArray, FloatArray, IntArray
+from fingerspice.base.arrays import ComplexArray, FloatArray, IntArray, read_only
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine import network
-from fingerspice.engine.collocation.readout import note
+from fingerspice.engine.collocation.readout import TRIED, note
+from fingerspice.numerics.lobatto import radau
 from fingerspice.numerics.modes import copy_to, invert
 
 # Entry of `counters`: evaluations of the right-hand side.
@@ -38,6 +40,22 @@ class Scheme(NamedTuple):
     to: ComplexArray
     back: ComplexArray
     h_max: float  # s
+
+
+@cache
+def radau_scheme(stages: int) -> Scheme:
+    """The Radau IIA method with its matrix diagonalised, so that each eigenvalue needs a linear system of n only."""
+    tableau = radau(stages)
+    values, vectors = np.linalg.eig(tableau.a)
+    back = np.linalg.inv(vectors)
+    upper = np.flatnonzero(values.imag > -1e-12)
+    # Of a conjugate pair keep one eigenvalue: the pair's contribution is twice its real part.
+    twice = np.where(values.imag[upper] > 1e-12, 2.0, 1.0)
+    return Scheme(
+        tableau.a, tableau.c, tableau.e, np.ascontiguousarray(tableau.dense), values[upper].astype(complex),
+        np.ascontiguousarray(back[upper].astype(complex)),
+        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
+    )  # fmt: skip
 
 
 class Work(NamedTuple):
@@ -97,16 +115,10 @@ def linearise(c: Nodal, y: FloatArray) -> None:
     n = net.k.shape[0]
     m = work.slope.shape[0]
     network.capacitances(net, room, y, sign)
-    work.mass[:] = 0.0
+    work.mass[:] = np.eye(m)
+    work.mass[:n, :n] = room.matrix
     for i in range(m):
-        largest = 1.0 if i >= n else 0.0
-        for j in range(n):
-            if i < n:
-                work.mass[i, j] = room.matrix[i, j]
-                largest = max(largest, abs(room.matrix[i, j]))
-        if i >= n:
-            work.mass[i, i] = 1.0
-        work.weight[i] = 1.0 / largest
+        work.weight[i] = 1.0 / np.abs(work.mass[i]).max()
     copy_to(work.stage, y)
     network.residual(net, room, jump, y, sign, work.rate, room.base)
     for j in range(m):
@@ -340,48 +352,30 @@ def _look(c: Nodal, t: float, h: float, theta: float, y: FloatArray) -> None:
 def _first_zero(c: Nodal, t: float, h: float, y: FloatArray) -> tuple[float, int]:
     """First fraction of the step at which a gap voltage leaves its branch, and the index of its area; 2 and -1 if none.
 
-    Each gap voltage is sampled at the eighths of the step, and its sign change found by regula falsi.
+    Each gap voltage is sampled at the eighths of the step, and its sign change found by bisection.
     """
-    first = 2.0
-    which = -1
+    first, which = 2.0, -1
     for i in range(c.sign.size):
         if c.net.gap[i] < 0:
             continue
-        lo = 0.0
-        f_lo = _signed(c, i, t, h, 0.0, y)
-        hi = 0.0
-        f_hi = 0.0
+        lo, f_lo = 0.0, _signed(c, i, t, h, 0.0, y)
+        hi, f_hi = 0.0, 0.0
         for part in range(1, 9):
             hi = 0.125 * part
             f_hi = _signed(c, i, t, h, hi, y)
             if f_hi < 0.0:
                 break
-            lo = hi
-            f_lo = f_hi
+            lo, f_lo = hi, f_hi
         if not f_hi < 0.0 or lo >= first:
             continue
-        if f_lo > 0.0:
-            for _ in range(100):
-                mid = (lo * f_hi - hi * f_lo) / (f_hi - f_lo)
-                if not lo < mid < hi:
-                    mid = 0.5 * (lo + hi)
-                if not lo < mid < hi:
-                    break
-                f_mid = _signed(c, i, t, h, mid, y)
-                # Illinois variant of regula falsi: the value at the end that stays is halved.
-                if f_mid < 0.0:
-                    hi = mid
-                    f_hi = f_mid
-                    f_lo *= 0.5
-                else:
-                    lo = mid
-                    f_lo = f_mid
-                    f_hi *= 0.5
-                if hi - lo <= 4e-16 or f_mid == 0.0:
-                    break
+        while f_lo > 0.0 and hi - lo > 4e-16:
+            middle = 0.5 * (lo + hi)
+            if _signed(c, i, t, h, middle, y) < 0.0:
+                hi = middle
+            else:
+                lo = middle
         if hi < first:
-            first = hi if f_lo > 0.0 else lo
-            which = i
+            first, which = hi if f_lo > 0.0 else lo, i
     return first, which
 
 
@@ -430,10 +424,7 @@ def _prepare(c: Nodal, run: Passage, now: FloatArray, slopes: FloatArray) -> boo
     """Derivative of the state, into `work.rate`, and of the residual, where the sources are `now`; False at a fold."""
     copy_to(c.room.s, now)
     copy_to(c.room.ds, slopes)
-    for i in range(c.sign.size):
-        if c.sign[i] == 0.0:
-            network.choose_signs(c.net, c.room, c.jump, run.y, c.sign)
-            break
+    network.choose_signs(c.net, c.room, c.jump, run.y, c.sign)
     if not network.rates(c.net, c.room, c.jump, run.y, c.sign, c.work.rate):
         return False
     copy_to(c.work.start, c.work.rate)
@@ -553,3 +544,13 @@ def advance(c: Nodal, run: Passage, t_end: float) -> int:
             control[BEFORE] = h_before
             return PAUSED
     return DONE
+
+
+def pass_jump(c: Nodal, y: FloatArray, before: FloatArray, counters: IntArray, peaks: FloatArray) -> bool:
+    """Take a state y through a jump of the sources from `before`, a ramp from 0 to 1; False where it meets a fold.
+
+    The arrays are updated as in `Passage`.
+    """
+    t_out, left, rows = read_only(np.zeros(0)), read_only(np.zeros(0, bool)), np.empty((0, y.size))
+    run = Passage(y, before, np.zeros(N_CONTROL), counters, peaks, False, t_out, left, rows, np.zeros((TRIED, 4)))
+    return bool(advance(c._replace(scheme=c.scheme._replace(h_max=1.0), jump=True), run, 1.0) == DONE)

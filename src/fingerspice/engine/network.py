@@ -125,6 +125,14 @@ class Sources(NamedTuple):
     series: FloatArray
 
 
+def ramp(before: FloatArray, after: FloatArray, t: float = 0.0) -> Sources:
+    """A jump of every source as a ramp over a second from time t (s) on."""
+    terms = np.zeros((before.size, 2, 6))
+    terms[:, 0, 0], terms[:, 1, 0], terms[:, 1, 1] = before, after - before, 1.0
+    edges = np.tile([t, t + 1.0], before.size)
+    return Sources(2 * np.arange(before.size + 1, dtype=np.int64), edges, terms, np.zeros((before.size, 0)))
+
+
 class Room(NamedTuple):
     """Arrays to work in: of the sources, the cells, the areas and the state."""
 
@@ -165,16 +173,16 @@ def at_sources(sources: Sources, index: IntArray, base: float, t: float, s: Floa
 
 
 @jit
-def followed(net: Net, i: int, sign: float, u: float) -> tuple[float, float]:
-    """Area (m^2) at gap voltage u on the branch g(|u|) = g(sign u), and its slope dg/du (m^2/V).
+def on_branch(mobile: bool, curve: FloatArray, sign: float, u: float) -> tuple[float, float]:
+    """1/A and its slope d(1/A)/du at gap voltage u on the branch A(|u|) = A(sign u), continued a little past 0 V.
 
-    Under `mobile`, far on the wrong side of 0 V it is the true area, so that an iteration towards the branch stays
-    where the area exists.
+    Under `mobile`, beyond this continuation on the wrong side, it is the true area A(|u|), so that an iteration can
+    approach the branch from there. Under `local` there is no such search, and a step across 0 V must see no kink.
     """
-    if net.mobile and sign * u < net.curves[i, 0]:
+    if mobile and sign * u < curve[0]:
         sign = -sign
-    inverse, slope = inverse_area(sign * u, net.curves[i])
-    return 1.0 / inverse, -sign * slope / (inverse * inverse)
+    q, dq = inverse_area(sign * u, curve)
+    return q, sign * dq
 
 
 @jit
@@ -234,13 +242,13 @@ def _areas(net: Net, room: Room, y: FloatArray, sign: FloatArray, leak: float) -
         room.slope[i] = 0.0
         room.rate[i] = 0.0
         if net.gap[i] >= 0:
-            wanted, slope = followed(net, i, sign[i], room.u[net.gap[i]])
+            inverse, slope = on_branch(net.mobile, net.curves[i], sign[i], room.u[net.gap[i]])
             if net.slow[i] >= 0:
                 room.area[i] = y[n + net.slow[i]] * net.area0[i]
-                room.rate[i] = leak * (wanted - room.area[i]) / net.tau[i]
+                room.rate[i] = leak * (1.0 / inverse - room.area[i]) / net.tau[i]
             else:
-                room.area[i] = wanted
-                room.slope[i] = slope
+                room.area[i] = 1.0 / inverse
+                room.slope[i] = -slope / (inverse * inverse)
 
 
 @jit
@@ -342,7 +350,9 @@ def gap_voltage(net: Net, room: Room, i: int, y: FloatArray) -> float:
 
 @jit
 def choose_signs(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray) -> None:
-    """Branch of each area: the sign of its gap voltage or, at 0 V, of the voltage's derivative."""
+    """Branches of the areas, if one is to be chosen (0): the signs of gap voltages or, at 0 V, of their derivatives."""
+    if np.all(sign != 0.0):
+        return
     rate = np.zeros(y.size)
     for i in range(sign.size):
         sign[i] = 1.0
@@ -357,3 +367,16 @@ def choose_signs(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArr
             if net.gap[i] >= 0 and gap_voltage(net, room, i, y) == 0.0:
                 # `rates` has left the cells' rates there.
                 sign[i] = -1.0 if room.along[net.gap[i]] < 0.0 else 1.0
+
+
+@jit
+def rates_at(
+    net: Net, sources: Sources, index: IntArray, base: float, t: float, y: FloatArray, sign: FloatArray
+) -> FloatArray:  # fmt: skip
+    """y' at t (s) after `base`, on these segments of the sources (see `at_sources`); NaN past a fold."""
+    room, out = new_room(net, y.size), np.empty(y.size)
+    at_sources(sources, index, base, t, room.s, room.ds)
+    choose_signs(net, room, False, y, sign)
+    if not rates(net, room, False, y, sign, out):
+        out[:] = np.nan
+    return out

@@ -21,15 +21,16 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.network import Modes
-from fingerspice.engine.network import Segment, at_sources, source
-from fingerspice.engine.one_area.model import branch_area, dot, follow, ramp, source_at, voltage_by_time, write_row_at
+from fingerspice.engine.network import Sources, at_sources, on_branch
+from fingerspice.engine.one_area.model import dot, jump_charges, ramp, source_at, voltage_by_time
 from fingerspice.numerics import linear
+from fingerspice.physics.contact import inverse_areas, inverse_areas_with_slopes
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.collocation import solve as solve_by_steps
-from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, segment_of
+from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, values_at
 from fingerspice.solve.runs import PAST_FOLD, Run, closed_form, gap_signals
 from fingerspice.solve.scenes import kept_with
-from fingerspice.solve.starting import StackState, from_stack, from_written, model_of, row_width, to_stack
+from fingerspice.solve.starting import as_shown, from_loop, model_of, to_loop
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import breakpoints_at, on_grid, same_time
 
@@ -43,11 +44,14 @@ MOST_MODES = 8
 def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float = 0.0) -> Run:
     """Outputs of a circuit with its areas fixed: the modes' responses to the single sources, superposed.
 
-    Areas (n_area,) in m^2 are the scene's by default, and a problem may ask for charge only if the circuit fixes them.
-    `bound` is the error from holding them, relative to the peaks; 0 where they are exact or have no effect.
+    Areas (n_area,) in m^2 are given for a stack that leaks, and a problem may ask for charge only if the circuit fixes
+    them. Without leaks the layers share each change of the voltage in fixed ratios, whatever the area. `bound` is the
+    error from holding the areas, relative to the peaks; 0 where they are exact or have no effect.
     """
-    scene, start, tables = problem.scene, problem.initial, Tables(problem, 1e-13, no_chirps=True)
+    scene, start = problem.scene, problem.initial
+    at_once, charge_error = scene.stack is not None and area is None, None
     area = scene.area0 if area is None else area
+    tables = Tables(problem, 1e-12 if at_once else 1e-13, no_chirps=not at_once)
     modes = kept_with(scene.prepared, ("modes", *area.tolist()), MOST_MODES, lambda: scene.modes_at(area))
     n = modes.rates.size
     v0, z_end = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before), start.y[n:]
@@ -55,15 +59,20 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     if sampled is not None:
         rows, last, end = *sampled, problem.t_stop
     else:
-        answer, last, end = _answer(problem, tables, modes, v0)
+        answer, last, end = _answer(problem, tables, None if at_once else modes, v0)
         rows = answer.x(modes)
-        if problem.charge:
+        if problem.charge and at_once:
+            z, current, charge_error = _loop_charge(problem, answer)
+            rows, z_end = np.hstack([rows, z, current]), _loop_charge(problem, last)[0][0]
+        elif problem.charge:
             flow = partial(_charge, problem, area, modes, v0)
             rows = np.hstack([rows, *flow(problem.t_out[: len(rows)], answer)])
             z_end = flow(np.array([end]), last)[0][0]
     y = np.concatenate([last.x(modes)[0], z_end])
     state = State(end, y, last.s[0], np.zeros(area.size), scene.charge_law)
-    return _finished(problem, tables, rows, state, bound, partial(solve_linear, area=area))
+    run = _finished(problem, tables, rows, state, bound, partial(solve_linear, area=None if at_once else area))
+    run.charge_error = charge_error
+    return run
 
 
 class _Answer(NamedTuple):
@@ -90,7 +99,7 @@ def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArra
     n, n_s, size = v0.size, len(problem.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
     v, s, integral, slope = (np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s))
-    v[size], s[size], end, first = v0, problem.initial.s_before, problem.t_start, 0
+    v[:], s[size], end, first = v0, problem.initial.s_before, problem.t_start, 0
     sources = None
     for window in tables:
         if any(table.edges.size < 2 for table in window):
@@ -100,7 +109,7 @@ def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArra
         before, beyond = t_out.searchsorted(end), t_out.searchsorted(end, "right")
         at = np.append(np.arange(first, before + np.count_nonzero(left[before:beyond])), size)
         t, side = np.append(t_out[at[:-1]], end), np.append(left[at[:-1]], True)
-        v[size] = 0.0
+        v[at] = 0.0 if modes is not None else v0
         for j, table in enumerate(window):
             given = table.edges, table.terms, table.series
             if modes is not None:
@@ -114,8 +123,7 @@ def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArra
     if tables.not_finite is None and first < size and sources is not None:
         after = after_the_end(problem) or sources
         v[first:size], integral[first:size] = v[size], integral[size]
-        at_sources(after, segment_index(after, end, "right"), end, 0.0, s[first], slope[first])
-        s[first:size], slope[first:size] = s[first], slope[first]
+        s[first:size], slope[first:size] = values_at(after, end)
         first = size
     out, last = (_Answer(v[part], s[part], integral[part], slope[part]) for part in (slice(first), slice(size, None)))
     return out, last, end
@@ -191,25 +199,22 @@ def _finished(
     return run
 
 
-def solve_algebraic(problem: Problem) -> Run:
-    """Outputs of a stack without leakage: the layers share each change of the source's voltage in fixed ratios."""
-    scene = problem.scene
-    model, start, width = model_of(scene), problem.inner, row_width(scene)
-    tables = Tables(problem, 1e-12)
-    answer, last, end = _answer(problem, tables, None, np.zeros(0))
-    rows, ended = np.empty((len(answer.s), width)), np.empty((1, width))
-    charge_error = follow(model, answer.s[:, 0], answer.slope[:, 0], start.y, start.u_before, rows)
-    # The final state is the left-hand one: it does not include a jump at the end.
-    follow(model, last.s[:, 0], np.zeros(1), start.y, start.u_before, ended)
-    u, u_gap = ended[0, :2].tolist()
-    state = from_stack(scene, StackState(end, ended[0, 5:].copy(), u, u_gap, start.offset))
-    shown = from_written(scene, rows, start.offset, by_layer=False)
-    run = _finished(problem, tables, shown, state, 0.0, solve_algebraic)
-    if problem.charge:
-        moved, held = rows[:, -1], rows[:, 0] / rows[:, 2] / model.s
-        most = float(np.abs(moved).max(initial=0.0) + np.abs(held).max(initial=0.0))
-        run.charge_error = float(charge_error) + ROUNDING * most
-    return run
+def _loop_charge(problem: Problem, answer: _Answer) -> tuple[FloatArray, FloatArray, float]:
+    """Charge (C) and current (A) of a stack without leaks, both (n_t, 1), and the error of the charge, C."""
+    model, (y, _), moved = model_of(problem.scene), problem.inner, np.empty(len(answer.s))
+    u, slope, x_gap, error = answer.s[:, 0].copy(), answer.slope[:, 0], float(dot(model.gap, y)), 0.0
+    u_gap = model.k_gap * u + x_gap
+    inverse, bend = inverse_areas_with_slopes(u_gap, model.curve)
+    held, current = u / inverse / model.s, slope / inverse / model.s
+    if model.mobile:
+        moved[:] = held
+        current -= np.sign(u_gap) * bend * model.k_gap * slope / inverse * held
+    else:
+        # What flows between two source voltages depends on these two alone, not on the path between them.
+        error = jump_charges(model, x_gap, float(problem.initial.s_before[0]), u, moved)
+    carried = problem.initial.y[-1] + (0.0 if model.mobile else moved)
+    most = float(np.abs(carried).max(initial=0.0) + np.abs(held).max(initial=0.0))
+    return (y[-1] + moved)[:, None], current[:, None], error + ROUNDING * most
 
 
 # Tolerance of a run towards a fold; and its stated error over the estimated one, which was as low as half the true one.
@@ -241,8 +246,7 @@ def run_to_fold(problem: Problem) -> Run | None:
 
 def lead_to_fold(problem: Problem, run: Run) -> Run | None:
     """Continue a run that stopped near a fold until it reaches the fold; None where it does not reach it."""
-    state, t_out = to_stack(problem.scene, run.state), problem.t_out
-    reached, path = _ahead(problem, run, state, FINEST_RTOL)
+    t_out, (reached, path) = problem.t_out, _ahead(problem, run, FINEST_RTOL)
     if path is None:
         return run if reached else None
     # The last row of the run may be the point where the steps stopped, which is not an output time.
@@ -250,17 +254,14 @@ def lead_to_fold(problem: Problem, run: Run) -> Run | None:
     done = run.t.size - int(stopped)
     later = t_out[done:]
     t = np.append(later[later < path.t], path.t)
-    written = path.rows(problem, t)
-    rows = from_written(problem.scene, written, state.offset, run.by_layer)[:, : run.rows.shape[1]]
+    rows, u_gap, run.state = path.outputs(problem, t)
+    shown = np.array([as_shown(problem.scene, row) if run.by_layer else row for row in rows])
     run.t, run.left = np.append(run.t[:done], t), np.append(problem.left[: done + t.size - 1], True)
-    run.rows = np.vstack([run.rows[:done], rows])
+    run.rows = np.vstack([run.rows[:done], shown[:, : run.rows.shape[1]]])
     run.t_failed, run.margin = path.t, 0.0
     for _, contact in run.record(problem).fingers:
-        force = contact.stress(written[:, 1]) / written[:, 2]
-        run.gaps[0, :2] = np.maximum(run.gaps[0, :2], (np.abs(written[:, 1]).max(), force.max()))
-    u, u_gap = written[-1, :2].tolist()
-    # Behind 5 columns that follow from it, a row has the state.
-    run.state = from_stack(problem.scene, StackState(path.t, written[-1, 5:].copy(), u, u_gap, state.offset))
+        force = contact.stress(u_gap) / inverse_areas(u_gap, model_of(problem.scene).curve)
+        run.gaps[0, :2] = np.maximum(run.gaps[0, :2], (np.abs(u_gap).max(), force.max()))
     return run
 
 
@@ -272,15 +273,14 @@ def meets_fold(problem: Problem, rtol: float) -> bool | None:
     run = solve_by_steps(problem, rtol)
     if run.status is not Status.FOLD:
         return False if run.status is Status.SUCCESS else None
-    return _ahead(problem, run, to_stack(problem.scene, run.state), rtol)[0]
+    return _ahead(problem, run, rtol)[0]
 
 
 class _Path(NamedTuple):
     """State (n + 1,), time since `begin` (s) and gap voltage (V) as functions of the variable s, up to the fold."""
 
     begin: float
-    segment: Segment
-    sign: float
+    sources: Sources
     scale: FloatArray
     solution: Any  # An `OdeSolution` of scipy
 
@@ -289,33 +289,38 @@ class _Path(NamedTuple):
         """Time of the fold, s."""
         return self.begin + float(self.solution(self.solution.t_max)[-2] * self.scale[-2])
 
-    def rows(self, problem: Problem, t: FloatArray) -> FloatArray:
-        """Rows of `engine.one_area.model.write_row` at times (s) on the path."""
+    def outputs(self, problem: Problem, t: FloatArray) -> tuple[list[FloatArray], FloatArray, State]:
+        """Rows as in `Record`, gap voltages along the loop (V) and the last state, at times t (s) on the path."""
         low, high = np.zeros(t.size), np.full(t.size, self.solution.t_max)
         # Time rises monotonically in s, but dt/ds tends to 0 at the fold: bisection is safe there, Newton is not.
         for _ in range(64):
             middle = 0.5 * (low + high)
             early = self.solution(middle)[-2] * self.scale[-2] < t - self.begin
             low, high = np.where(early, middle, low), np.where(early, high, middle)
-        rows = np.empty((t.size, row_width(problem.scene)))
-        for row, z, time in zip(rows, (self.solution(high).T * self.scale), t, strict=True):
-            u, du = source(self.segment, time - self.segment.start)
-            write_row_at(model_of(problem.scene), u, du, z[:-2].copy(), self.sign, z[-1], row)
-        return rows
+        model, rows, z = model_of(problem.scene), list[FloatArray](), self.solution(high).T * self.scale
+        for here, time in zip(z, t.tolist(), strict=True):
+            s, ds = values_at(self.sources, time)
+            u, du, y, u_gap, dy = s[0], ds[0], here[:-2].copy(), here[-1], np.empty(here.size - 2)
+            state = from_loop(problem.scene, time, y, u, u_gap)
+            margin, speed = voltage_by_time(model, u, du, y, math.copysign(1.0, u_gap), u_gap, dy)
+            q, dq = on_branch(model.mobile, model.curve, math.copysign(1.0, u_gap), u_gap)
+            # i = Q' with Q = A U / S + z, and u' from the area equation.
+            current = dy[-1] + (du / q - dq * speed / margin * u / (q * q)) / model.s
+            rows.append(np.append(state.y, current))
+        return rows, z[:, -1], state
 
 
-def _ahead(problem: Problem, run: Run, state: StackState, rtol: float) -> tuple[bool, _Path | None]:
-    """Whether a run that stopped in this state reaches a fold, and the path to it where it is not there already."""
-    model, u = model_of(problem.scene), state.u_gap
+def _ahead(problem: Problem, run: Run, rtol: float) -> tuple[bool, _Path | None]:
+    """Whether a run that stopped reaches a fold, and the path to it where it is not there already."""
+    model, t, (y, u) = model_of(problem.scene), run.state.t, to_loop(problem.scene, run.state)
     windows = list(Tables(problem, FINEST_RTOL))
-    window = next((one for one in windows if one[0].edges[-1] > state.t), windows[-1])
-    segment, since = segment_of(joined(window), state.t, "right")
-    u_source, slope = source(segment, since)
-    if since == 0.0:
-        u = float(ramp(model, model.k_gap * u_source, dot(model.gap, state.y), u))
-    sign = math.copysign(1.0, u)
+    window = next((one for one in windows if one[0].edges[-1] > t), windows[-1])
+    sources = joined(window)
+    (u_source,), (slope,) = values_at(sources, t)
+    if t in sources.edges:
+        u = float(ramp(model, model.k_gap * u_source, dot(model.gap, y), u))
     if u != 0.0 and not math.isnan(u):
-        margin, _ = voltage_by_time(model, u_source, slope, state.y, sign, u, np.empty(state.y.size))
+        margin, _ = voltage_by_time(model, u_source, slope, y, math.copysign(1.0, u), u, np.empty(y.size))
         u = u if margin > 0.0 else math.nan
     # At the fold or past it, as after a jump of the source.
     if run.margin <= 0.0 or math.isnan(u):
@@ -325,23 +330,25 @@ def _ahead(problem: Problem, run: Run, state: StackState, rtol: float) -> tuple[
     tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if run.margin < NEAR else (rtol, LOOSER_RTOL)
     for tried in sorted({max(rtol, x) for x in tries}):
         with suppress(_LostError):
-            path = _path(problem, state, segment, sign, u, tried)
+            path = _path(problem, t, y, sources, u, tried)
             return path is not None, path
     return False, None
 
 
-def _path(problem: Problem, state: StackState, segment: Segment, sign: float, u: float, rtol: float) -> _Path | None:
-    """The path from a state with the gap voltage u (V) on the branch `sign` to a fold; None where it meets none."""
-    t, y, model, n = state.t, state.y, model_of(problem.scene), state.y.size
-    pace = model.tau if math.isfinite(model.tau) else segment.length
+def _path(problem: Problem, t: float, y: FloatArray, sources: Sources, u: float, rtol: float) -> _Path | None:
+    """The path from the loop's state y at t (s), with the gap voltage u (V), to a fold; None where it meets none."""
+    model, n, sign = model_of(problem.scene), y.size, math.copysign(1.0, u)
+    index, s, ds = segment_index(sources, t, "right"), np.empty(1), np.empty(1)
+    start, stop = sources.edges[index[0] : index[0] + 2]
+    pace = model.tau if math.isfinite(model.tau) else stop - start
     scale = np.full(n + 2, max(np.abs(y[:-1]).max(), abs(u)))
     scale[n - 1 :] = model.area0 / model.s * abs(u), pace, abs(u)
     dy, left = np.empty(n), MOST_EVALUATIONS
 
     def at(z: FloatArray) -> tuple[float, float]:
         here = z * scale
-        u_here, du_here = source(segment, t - segment.start + here[n])
-        margin, speed = voltage_by_time(model, u_here, du_here, here[:n], sign, here[n + 1], dy)
+        at_sources(sources, index, t, here[n], s, ds)
+        margin, speed = voltage_by_time(model, s[0], ds[0], here[:n], sign, here[n + 1], dy)
         return float(margin), float(speed)
 
     def slope(_: float, z: FloatArray) -> FloatArray:
@@ -363,9 +370,8 @@ def _path(problem: Problem, state: StackState, segment: Segment, sign: float, u:
     begin = np.concatenate([y, [0.0, u]]) / scale
     far = 3.0 * at(begin)[0]
     # At the fold, at the end of the segment, and too far from the fold again.
-    left_over = segment.start + segment.length - t
     events: list[Any] = [
-        lambda _, z: at(z)[0] - NOTHING_LEFT, lambda _, z: left_over - float(z[n]) * pace, lambda _, z: far - at(z)[0]
+        lambda _, z: at(z)[0] - NOTHING_LEFT, lambda _, z: stop - t - float(z[n]) * pace, lambda _, z: far - at(z)[0]
     ]  # fmt: skip
     for event in events:
         event.terminal = True
@@ -378,8 +384,9 @@ def _path(problem: Problem, state: StackState, segment: Segment, sign: float, u:
         return None
     # The gap voltage was integrated from its rate, so check that it still solves the area equation.
     last = found.y[:, -1] * scale
-    q, _ = branch_area(model, sign, last[n + 1])
-    k_u = model.k_gap * source(segment, t - segment.start + last[n])[0]
-    if abs(last[n + 1] - k_u - model.area0 * q * dot(model.gap, last[:n])) > STRAYED * abs(last[n + 1]):
+    at_sources(sources, index, t, last[n], s, ds)
+    q, _ = on_branch(model.mobile, model.curve, sign, last[n + 1])
+    missed = last[n + 1] - model.k_gap * s[0] - model.area0 * q * dot(model.gap, last[:n])
+    if abs(missed) > STRAYED * abs(last[n + 1]):
         raise _LostError
-    return _Path(t, segment, sign, scale, found.sol)
+    return _Path(t, sources, scale, found.sol)

@@ -19,23 +19,23 @@ from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
 from fingerspice.engine.collocation.exponential import new_tables
 from fingerspice.engine.collocation.loop import Looks, no_looks
-from fingerspice.engine.collocation.step_control import end_row
+from fingerspice.engine.collocation.step_control import enter
 from fingerspice.engine.many_areas.form import REFERRED, Form, held, new_network_work
 from fingerspice.engine.many_areas.step import ManyAreas, References
-from fingerspice.engine.network import Sources, source
+from fingerspice.engine.network import Sources, ramp
 from fingerspice.engine.one_area import system as systems
-from fingerspice.engine.one_area.model import Model, dot, gap_voltage, write_row_at
+from fingerspice.engine.one_area.model import Model, dot, gap_voltage
 from fingerspice.engine.one_area.rows import Work, new_stack_work
 from fingerspice.engine.one_area.step import OneArea
 from fingerspice.engine.one_area.system import LEVEL_RATIO, System, area_error, area_missed
 from fingerspice.numerics.lobatto import integral_table
-from fingerspice.physics.contact import inverse_areas
+from fingerspice.physics.contact import inverse_area_range, inverse_areas
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import sided
-from fingerspice.solve.problem import ROUNDING, Problem, Tables, ramp, segment_of
+from fingerspice.solve.problem import ROUNDING, Problem, Tables, values_at
 from fingerspice.solve.runs import Progress, Run, excess_of, integrate
 from fingerspice.solve.scenes import Scene, kept_with
-from fingerspice.solve.starting import StackState, as_marched, from_stack, from_written, model_of, row_width, to_stack
+from fingerspice.solve.starting import as_shown, from_loop, model_of, to_loop
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
 
 # Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each.
@@ -95,7 +95,7 @@ def system_of(
     stress = 0.0 if contact is None else float(contact.stress(1.0))
     u_max, n = u_peak or max(scene.u_peak, u_top), model.gap.size
     nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
-    u_range = systems.area_range(model, u_max)
+    u_range = inverse_area_range(u_max, 17, model.curve)
     return systems.build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
 
 
@@ -122,17 +122,14 @@ class Track(Stepping):
         self.error = np.zeros(n + 1)
         self.control["branch_length"] = np.inf
         self.control["margin"] = 1.0
-        self._start_from(problem.inner)
+        self.load(problem.initial)
         self.look_for_period(self.system.rates, np.ones(n), repeat)
 
-    def _start_from(self, start: StackState) -> None:
-        self.start, self.y[:], self.control["u_before"] = start, start.y, start.u_before
+    def load(self, initial: State) -> None:
+        super().load(initial)
+        (self.y[:], u_gap), self.control["u_before"] = to_loop(self.problem.scene, initial), initial.s_before[0]
         if self.system.model.mobile and self.sign[0] != 0.0:
-            self.control["u_gap"], self.control["sign"] = start.u_gap, math.copysign(1.0, start.u_gap)
-
-    def again(self, initial: State, tol: float) -> None:
-        super().again(initial, tol)
-        self._start_from(to_stack(self.problem.scene, initial))
+            self.control["u_gap"], self.control["sign"] = u_gap, math.copysign(1.0, u_gap)
 
     @property
     def rounding(self) -> list[float]:
@@ -148,53 +145,35 @@ class Track(Stepping):
             raise OutOfRangeError(self.system.u_top)
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
-            self.control["u_before"], _ = source(*segment_of(sources, self.t, "left"))
+            (self.control["u_before"],), _ = values_at(sources, self.t, "left")
         return super().failed(code, sources)
 
     def state(self) -> State:
-        c = self.control
-        found = StackState(self.t, self.y.copy(), float(c["u_before"]), float(c["u_gap"]), self.start.offset)
-        return on_branch(self.problem.scene, self.system.model, found, float(c["sign"]))
+        model, before, u_gap = self.system.model, float(self.control["u_before"]), float(self.control["u_gap"])
+        if model.mobile:
+            u_gap = gap_at(model, self.y, before, float(self.control["sign"]) or 1.0, u_gap)
+        return from_loop(self.problem.scene, self.t, self.y, before, u_gap)
 
-    def written(self) -> FloatArray:
+    def jump(self, after: FloatArray) -> bool:
+        met = enter(self.system.model, self.pace.charge, float(after[0]), self.y, self.control)
+        self.control["u_before"] = after[0]
+        return bool(met)
+
+    def completed(self) -> None:
         n_out, model, shown = int(self.counters[readout.OUTPUT]), self.system.model, self.problem.scene.shown
-        rows, n = self.out[:, :n_out].T, shown.turn.size
+        rows, n = self.rows[:n_out], shown.turn.size
         rows[:, :n] *= shown.turn
         if self.pace.charge and model.mobile:
             (cell,), network = shown.measured, shown.network
             u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out])
             u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
-            rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - self.problem.inner.offset
-        return rows
+            rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s
 
-    def finish(self, sources: Sources, after: Sources | None) -> None:
-        first = int(self.counters[readout.OUTPUT])
-        row = np.empty(row_width(self.problem.scene))
-        segment, tau = segment_of(after or sources, self.problem.t_stop, "right")
-        model = self.system.model
-        # `end_row` applies a jump at the end to these copies, so that the final state remains the left-hand one.
-        end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.controls.copy(), row)
-        self.out[:, first:] = as_marched(self.problem.scene, row[None, :])[0, : len(self.out), None]
-        self.counters[readout.OUTPUT] = self.t_out.size
-
-    def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
-        # This model's area curve may reach higher voltages than the curve of the scene's model.
-        model, c = self.system.model, self.control
-        segment, tau = segment_of(sources, self.t, side)
-        row = np.empty(row_width(self.problem.scene))
-        u, du = source(segment, tau)
-        write_row_at(model, u, du, self.y, c["sign"], _gap_at(model, self.y, u, c["sign"], c["u_gap"]), row)
-        return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
+    def row(self, state: State, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+        return as_shown(self.problem.scene, super().row(state, sources, side))[: len(self.out)]
 
 
-def on_branch(scene: Scene, model: Model, state: StackState, sign: float) -> State:
-    """The state with its gap voltage computed anew from the area equation, on the branch with this sign."""
-    if model.mobile:
-        state = state._replace(u_gap=_gap_at(model, state.y, state.u_before, sign or 1.0, state.u_gap))
-    return from_stack(scene, state)
-
-
-def _gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> float:
+def gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> float:
     """Gap voltage (V) at a state under a source of u (V), on the branch with this sign and near its `last` value."""
     found = float(gap_voltage(model, model.k_gap * u, dot(model.gap, y), sign, last))
     # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
@@ -336,7 +315,6 @@ class March(Stepping):
         self.capacitance = float(problem.network.capacitance(scene.area0).sum())
         super().__init__(problem, tol * u_scale, size - n_s, size + n_s if problem.charge else size)
         self.control["magnified"] = 1.0
-        self.rows = self.out.T
         self.error = np.zeros(self.n + self.n_slow)
         self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
         self.shortest = problem.waveform.shortest_time()
@@ -411,7 +389,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     if is_stack:
         # The largest gap voltage to expect.
         share = met * model_of(problem.scene).k_gap if np.isfinite(met) else 0.0
-        u_scale = max(share, float(np.abs(problem.inner.y[:-1]).max(initial=0.0))) or GUESS
+        u_scale = max(share, float(np.abs(problem.inner[0][:-1]).max(initial=0.0))) or GUESS
     else:
         u_scale = max(problem.largest, met) or GUESS
     tol, top, nfev, attempts, tries_out = LOCAL_SHARE * rtol, 0.0, 0, 0, True

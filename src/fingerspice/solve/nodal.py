@@ -12,25 +12,21 @@ import threading
 import time
 import warnings
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from fingerspice.base.announcing import tell
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.base.compiled import jit
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.engine import implicit
-from fingerspice.engine.collocation.readout import TRIED
-from fingerspice.engine.implicit import Nodal, Passage, Scheme, advance, new_work
-from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_signs, new_room, rates
-from fingerspice.numerics.lobatto import radau
-from fingerspice.physics.contact import inverse_area
+from fingerspice.engine.implicit import Nodal, Passage, Scheme, advance, new_work, radau_scheme
+from fingerspice.engine.network import Sources, new_room, ramp, rates_at
 from fingerspice.results.outcome import Status
 from fingerspice.solve import runs
-from fingerspice.solve.problem import ROUNDING, Problem, Tables, ramp, segment_index, values_at
+from fingerspice.solve.problem import ROUNDING, Problem, Tables, segment_index, values_at
 from fingerspice.solve.runs import Integration, Progress, Run, apart, closed_form, excess_of, gap_signals, integrate
 
 # Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. They need different
@@ -56,22 +52,6 @@ _BETWEEN, LEAST_SHARE = 0.1, 1e-3
 # Limit of accepted and rejected steps: at the start, and over the whole run. A run that needs more has a cause that
 # smaller steps do not remove.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
-
-
-@cache
-def radau_scheme(stages: int) -> Scheme:
-    """The Radau IIA method with its matrix diagonalised, so that each eigenvalue needs a linear system of n only."""
-    tableau = radau(stages)
-    values, vectors = np.linalg.eig(tableau.a)
-    back = np.linalg.inv(vectors)
-    upper = np.flatnonzero(values.imag > -1e-12)
-    # Of a conjugate pair keep one eigenvalue: the pair's contribution is twice its real part.
-    twice = np.where(values.imag[upper] > 1e-12, 2.0, 1.0)
-    return Scheme(
-        tableau.a, tableau.c, tableau.e, np.ascontiguousarray(tableau.dense), values[upper].astype(complex),
-        np.ascontiguousarray(back[upper].astype(complex)),
-        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
-    )  # fmt: skip
 
 
 class Collocation(Integration):
@@ -102,6 +82,17 @@ class Collocation(Integration):
     def t(self) -> float:
         return float(self.control[implicit.BASE] + self.control[implicit.T])
 
+    @property
+    def met(self) -> FloatArray:
+        """(n_finger, 4): Peaks of the gaps' voltages (V) and forces (N) so far, as in `Run.gaps`, without errors."""
+        out = np.zeros((len(self.problem.network.fingers), 4))
+        for row, i in zip(out, self.problem.network.fingers, strict=True):
+            peak, contact = float(self.peaks[i]), self.problem.network.contacts[i]
+            assert contact is not None
+            area = float(contact.area(peak)) if self.net.gap[i] >= 0 else float(self.net.area0[i])
+            row[:2] = peak, float(contact.stress(peak)) * area
+        return out
+
     def nodal(self, sources: Sources) -> Nodal:
         """The network with these sources, as the compiled steps take it."""
         return Nodal(self.net, self.room, self.scheme, self.work, sources, False, self.sign, self.scale, self.tol)
@@ -122,19 +113,15 @@ class Collocation(Integration):
                     return Status.TOO_MANY_STEPS
                 if self.progress is not None:
                     self.progress(done)
-            elif code == implicit.STEP_UNDERFLOW or not self.jump(values_at(sources, self.t)):
+            elif code == implicit.STEP_UNDERFLOW or not self.jump(values_at(sources, self.t)[0]):
                 return self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        run = Passage(
-            self.y, self.s_before.copy(), np.zeros(implicit.N_CONTROL), self.counters, self.peaks, False,
-            self.t_out[:0], self.left[:0], np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
-        )  # fmt: skip
         nodal = self.nodal(ramp(self.s_before, after))
-        code = advance(nodal._replace(scheme=self.scheme._replace(h_max=1.0), jump=True), run, 1.0)
+        met = implicit.pass_jump(nodal, self.y, self.s_before.copy(), self.counters, self.peaks)
         self.s_before[:] = after
         self.control[[implicit.H, implicit.JUMPED]] = self.control[implicit.H_AFTER_JUMP], 1.0
-        return code == implicit.DONE
+        return met
 
 
 def pass_through(
@@ -158,13 +145,9 @@ def _schemes(problem: Problem) -> tuple[Scheme, Scheme]:
 
 
 def _integrate(problem: Problem, scheme: Scheme, tol: float, u_scale: float, progress: Progress | None = None) -> Run:
-    one, net = Collocation(problem, scheme, tol, u_scale, progress), problem.scene.net
+    one = Collocation(problem, scheme, tol, u_scale, progress)
     run = integrate(one, Tables(problem, tol), progress)
-    run.gaps = np.zeros((len(problem.network.fingers), 4))
-    for row, i in zip(run.gaps, problem.network.fingers, strict=True):
-        row[0], contact = one.peaks[i], problem.network.contacts[i]
-        if contact is not None and net.gap[i] >= 0 and net.slow[i] < 0:
-            row[1] = float(contact.stress(row[0])) / inverse_area(row[0], net.curves[i])[0]
+    run.gaps = one.met
     return run
 
 
@@ -317,19 +300,6 @@ class _FailedError(Exception):
     """A library's integrator gave up."""
 
 
-@jit
-def _rate(
-    net: Net, room: Room, sources: Sources, index: IntArray, base: float, t: float, y: FloatArray, sign: FloatArray
-) -> FloatArray:  # fmt: skip
-    """y' at t (s) after `base`, NaN past a fold; the branches of the areas follow from the voltages."""
-    at_sources(sources, index, base, t, room.s, room.ds)
-    choose_signs(net, room, False, y, sign)
-    out = np.empty(y.size)
-    if not rates(net, room, False, y, sign, out):
-        out[:] = np.nan
-    return out
-
-
 class Foreign(Collocation):
     """One integration by a library, from edge to edge of the sources; jumps are integrated as in `Collocation`."""
 
@@ -390,7 +360,7 @@ class Foreign(Collocation):
     def through(self, sources: Sources, t_end: float) -> Status:
         edges = np.unique(sources.edges)
         for stop in np.append(edges[(edges > self.t) & (edges < t_end)], t_end).tolist():
-            after = values_at(sources, self.t)
+            after, _ = values_at(sources, self.t)
             jumps = np.abs(after - self.s_before) > implicit.ROUNDING * np.maximum(abs(after), abs(self.s_before))
             if np.any(jumps) and not self.jump(after):
                 return self.stuck()
@@ -406,7 +376,8 @@ class Foreign(Collocation):
         base, n_s, index = self.t, self.s_before.size, segment_index(sources, self.t, "right")
 
         def rate(t: float, y: FloatArray) -> FloatArray:
-            return np.asarray(_rate(self.net, self.room, sources, index, base, t, np.ascontiguousarray(y), self.sign))
+            self.sign[:] = 0.0
+            return np.asarray(rates_at(self.net, sources, index, base, t, np.ascontiguousarray(y), self.sign))
 
         done = int(self.counters[implicit.OUTPUT])
         inside = (self.t_out < stop) | ((self.t_out == stop) & self.left)
@@ -421,7 +392,7 @@ class Foreign(Collocation):
         self.y[:] = states[-1]
         # The last call leaves the branches as they are at the end.
         rate(stop - base, self.y)
-        self.s_before[:] = self.room.s
+        self.s_before[:], _ = values_at(sources, stop, "left")
         self.control[implicit.BASE] = stop
 
 

@@ -296,17 +296,11 @@ class Search(Period):
 
     def _collocated(self, problem: Problem, tol: float) -> _Pass:
         """One pass by the implicit method, with its error from a coarser pass."""
-        scene = problem.scene
         status, one, error = pass_through(problem, self.sources, tol, self.scale)
         if status is not Status.SUCCESS:
             raise no_period(problem, status, one.t)
-        met = np.zeros((len(self.fingers), 4))
-        for row, i in zip(met, self.fingers, strict=True):
-            peak, contact = float(one.peaks[i]), self.contacts[i]
-            area = float(contact.area(peak)) if scene.net.gap[i] >= 0 else float(scene.area0[i])
-            row[:2] = peak, float(contact.stress(peak)) * area
         rounding = (np.abs(self.gap[:, : self.n]) @ np.abs(self.modes.inverse)).sum(axis=1)
-        return _Pass(one.y, one.s_before, error, met, 1.0, 10.0 + rounding)
+        return _Pass(one.y, one.s_before, error, one.met, 1.0, 10.0 + rounding)
 
     def close(self) -> Found:
         """The periodic state, to `rtol` or as far as round-off permits."""

@@ -119,7 +119,7 @@ def _refuse(problem: Problem, tier: str, best: str) -> None:
 
 def _stores(problem: Problem) -> bool:
     """Whether a stack starts with charge on the interfaces between its layers."""
-    return problem.scene.stack is not None and bool(problem.inner.y[:-1].any())
+    return problem.scene.stack is not None and bool(problem.inner[0][:-1].any())
 
 
 def _of_network(problem: Problem, changed: float) -> tuple[str, str]:

@@ -19,11 +19,11 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import area_given, time_slip
 from fingerspice.circuit.network import Network
-from fingerspice.engine.network import Segment, Sources, at_sources
+from fingerspice.engine.network import Sources, at_sources
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.scenes import Scene, kept_with, scene_of
-from fingerspice.solve.starting import StackState, initial_state, to_stack
+from fingerspice.solve.starting import initial_state, to_loop
 from fingerspice.waveforms import sampling
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, is_sampled, same_time, source_table
@@ -94,9 +94,9 @@ class Problem:
         return ROUNDING * max(self.largest, self.scene.u_size)
 
     @cached_property
-    def inner(self) -> StackState:
-        """The start of a stack in the form of its own equations."""
-        return to_stack(self.scene, self.initial)
+    def inner(self) -> tuple[FloatArray, float]:
+        """The start of a stack in its own equations, as in `to_loop`."""
+        return to_loop(self.scene, self.initial)
 
     def done(self, t: float) -> float:
         """Fraction of the run that is done at time t, s."""
@@ -348,30 +348,24 @@ def joined(tables: list[SourceTable]) -> Sources:
     return Sources(first, np.concatenate([t.edges for t in tables]), np.concatenate(terms), np.concatenate(series))
 
 
-def ramp(before: FloatArray, after: FloatArray, t: float = 0.0) -> Sources:
-    """A jump of every source as a ramp over a second from time t (s) on."""
-    terms = np.zeros((before.size, 2, 6))
-    terms[:, 0, 0], terms[:, 1, 0], terms[:, 1, 1] = before, after - before, 1.0
-    edges = np.tile([t, t + 1.0], before.size)
-    return Sources(2 * np.arange(before.size + 1, dtype=np.int64), edges, terms, np.zeros((before.size, 0)))
-
-
-def values_at(sources: Sources, t: float) -> FloatArray:
-    """Right-hand values of the sources at t (s)."""
-    out, slope = np.empty((2, sources.first.size - 1))
-    at_sources(sources, segment_index(sources, t, "right"), t, 0.0, out, slope)
-    return out
+def values_at(sources: Sources, t: float, side: Literal["left", "right"] = "right") -> tuple[FloatArray, FloatArray]:
+    """Values of the sources at t (s) and their slopes (per second), on the given side."""
+    values, slopes = np.empty((2, sources.first.size - 1))
+    at_sources(sources, segment_index(sources, t, side), t, 0.0, values, slopes)
+    return values, slopes
 
 
 def after_the_end(problem: Problem) -> Sources | None:
     """The sources from the end of a run on, where one of them may jump there; else None."""
-    stop = problem.t_stop
-    if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
-        return None
+    stop, step = problem.t_stop, problem.step
 
-    key, step = ("after", stop, problem.step), problem.step
-    tables = (source_table(w, stop, stop + step, 1e-10, step) for w in problem.waveforms)
-    return kept_with(problem.waveform.kept, key, 1, lambda: joined(list(tables)))
+    def make() -> tuple[Sources, ...]:
+        if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
+            return ()
+        return (joined([source_table(w, stop, stop + step, 1e-10, step) for w in problem.waveforms]),)
+
+    found = kept_with(problem.waveform.kept, ("after", stop, step), 1, make)
+    return found[0] if found else None
 
 
 def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) -> IntArray:
@@ -379,10 +373,3 @@ def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) ->
     spans = itertools.pairwise(sources.first)
     found = ((int(sources.edges[a:b].searchsorted(t, side)) - 1, b - a - 2) for a, b in spans)
     return np.array([min(max(i, 0), last) for i, last in found])
-
-
-def segment_of(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:
-    """The segment of a single source that contains time t (s), and the time since the segment's start, s."""
-    (i,) = segment_index(sources, t, side).tolist()
-    start = float(sources.edges[i])
-    return Segment(start, float(sources.edges[i + 1]) - start, sources.terms[i], sources.series[i]), t - start

@@ -12,7 +12,7 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
 from fingerspice.engine.collocation.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
-from fingerspice.engine.network import Sources, at_sources, new_room, rates
+from fingerspice.engine.network import Sources, rates_at
 from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, State, Status, last_tried
 from fingerspice.results.record import Record
 from fingerspice.results.steps import ClosedForm, Recorded
@@ -115,7 +115,7 @@ class Integration(ABC):
     """One integration of a problem in progress."""
 
     counters: IntArray  # With the indices of `engine.collocation.readout`
-    rows: FloatArray  # (n_out, width): Outputs as in `Record`, of networks, whose steps have the same state
+    rows: FloatArray  # (n_out, width): Outputs as in `Record`, those of exponential steps once they are `completed`
     detail = ""  # Message of a method about its failure
 
     def __init__(self, problem: Problem) -> None:
@@ -150,28 +150,28 @@ class Integration(ABC):
         """Apply a jump of the sources to their values `after`; False where the jump goes past a fold."""
         raise NotImplementedError
 
-    def finish(self, sources: Sources, after: Sources | None) -> None:
-        """Write the right-hand outputs at the end of the run; `after`, the sources there, may begin with a jump."""
-        if after is not None:
-            values = values_at(after, self.problem.t_stop)
-            if np.any(values != self.s_before) and not self.jump(values):
-                return
-        self.rows[int(self.counters[OUTPUT]) :] = self.row(after or sources, "right")
+    def completed(self) -> None:
+        """Give the rows written so far the form of `Record`, which those of most methods have from the beginning."""
+        return
+
+    def finish(self, state: State, sources: Sources) -> None:
+        """Write the right-hand outputs at the end of the run, with the state there, before a jump of the sources."""
+        if (after := after_the_end(self.problem)) is not None:
+            values, _ = values_at(after, self.problem.t_stop)
+            if np.any(values != state.s_before):
+                if not self.jump(values):
+                    return
+                state = self.state()
+        self.rows[int(self.counters[OUTPUT]) :] = self.row(state, after or sources, "right")
         self.counters[OUTPUT] = self.t_out.size
 
-    def written(self) -> FloatArray:
-        """The rows written so far."""
-        return self.rows[: int(self.counters[OUTPUT])]
-
-    def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
-        """The row at the time reached, with left- or right-hand values of the sources; NaN past a fold."""
+    def row(self, state: State, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+        """The row of a state, with left- or right-hand values of the sources; NaN past a fold."""
         if not self.problem.charge:
-            return self.y.copy()
-        room, n_s = new_room(self.net, self.y.size), self.s_before.size
-        at_sources(sources, segment_index(sources, self.t, side), self.t, 0.0, room.s, room.ds)
-        rate = np.full(self.y.size, np.nan)
-        found = rates(self.net, room, False, self.y, self.sign, rate)
-        return np.concatenate([self.y, rate[-n_s:] if found else np.full(n_s, np.nan)])
+            return state.y.copy()
+        index = segment_index(sources, state.t, side)
+        rate = rates_at(self.net, sources, index, state.t, 0.0, state.y, state.sign.copy())
+        return np.append(state.y, rate[-state.s_before.size :])
 
 
 def integrate(one: Integration, tables: Tables, progress: Progress | None = None) -> Run:
@@ -194,12 +194,13 @@ def integrate(one: Integration, tables: Tables, progress: Progress | None = None
             status, t_failed = Status.SOURCE_NOT_FINITE, tables.not_finite
             break
     state = one.state()
+    one.completed()
     if status is Status.SUCCESS and one.counters[OUTPUT] < t_out.size and sources is not None:
-        one.finish(sources, after_the_end(problem))
+        one.finish(state, sources)
     here = None
     if t_failed is not None and sources is not None and state.t > problem.t_start:
-        here = one.row(sources, "left")
-    rows = one.written()
+        here = one.row(state, sources, "left")
+    rows = one.rows[: int(one.counters[OUTPUT])]
     stats = {name: int(one.counters[i]) for name, i in (("steps", ACCEPTED), ("rejected", REJECTED), ("zeros", ZEROS))}
     return Run(
         t_out[: len(rows)], left[: len(rows)], rows, status, int(one.counters[NFEV]), stats, state,

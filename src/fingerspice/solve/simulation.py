@@ -19,7 +19,7 @@ from fingerspice.circuit.describe import Parameters, Sources, area_given, circui
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
-from fingerspice.solve.closed_form import lead_to_fold, run_to_fold, solve_algebraic, solve_linear
+from fingerspice.solve.closed_form import lead_to_fold, run_to_fold, solve_linear
 from fingerspice.solve.collocation import solve as solve_exponential
 from fingerspice.solve.derivatives import check_request, sensitivities_of
 from fingerspice.solve.nodal import solve_coupled, solve_foreign
@@ -219,10 +219,9 @@ def integrated(
 ) -> tuple[Run, str]:
     """A run as planned, with its stated error compared with `rtol`, and the name of its method."""
     name = plan.tier
-    if name == "algebraic":
-        run = solve_algebraic(problem)
-    elif name == "linear":
-        run = solve_linear(problem, None if problem.scene.stack is None else np.array([plan.area]), plan.error_bound)
+    if name != "coupled":
+        leaks = name == "linear" and problem.scene.stack is not None
+        run = solve_linear(problem, np.array([plan.area]) if leaks else None, plan.error_bound)
     else:
         run, name = _stepped(problem, method, own_rtol(problem, plan, rtol), progress)
     state_error(problem, run, plan, rtol)

@@ -1,8 +1,7 @@
 """The initial state of a run, and the form that a state has in a stack's own equations.
 
 The live voltages along the loop are k U + v. The stack's own state x is v under `local`, and v A / A_0 under `mobile`
-(see `engine.one_area.model`). The charge delivered by the source is z under `local`, and z + A U / S - offset under
-`mobile`.
+(see `engine.one_area.model`). The charge delivered by the source is z under `local`, and z + A U / S under `mobile`.
 
 A run starts from an earlier solution, or from the capacitors' voltages at t = 0 by the deck, made consistent with
 Kirchhoff's voltage law. The rules are those of SPICE, compared with ngspice 39:
@@ -21,11 +20,9 @@ reduced linearly to 0, because a jump of the sources is the limit of a ramp.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,7 +31,8 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
 from fingerspice.circuit.statespace import Stack
-from fingerspice.engine.network import Net
+from fingerspice.engine.implicit import N_COUNTERS, Nodal, new_work, pass_jump, radau_scheme
+from fingerspice.engine.network import Net, new_room, ramp
 from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
@@ -43,78 +41,51 @@ from fingerspice.solve.scenes import Scene, kept_with
 from fingerspice.waveforms.waveform import DC, require
 
 
-class StackState(NamedTuple):
-    """A state in the engine's form."""
-
-    t: float  # s
-    y: FloatArray  # (n + 1,): State x (V), and z (C) last
-    u_before: float  # Voltage around the loop just before `t`, V
-    u_gap: float  # Gap voltage along the loop, V
-    offset: float  # Value of A U / S at the start of the run, subtracted so that the charge counts from there, C
-
-
 def model_of(scene: Scene) -> Model:
     """The model of a scene that is known to be a stack."""
     assert scene.model is not None
     return scene.model
 
 
-def to_stack(scene: Scene, state: State) -> StackState:
-    """A state of a stack in the engine's form."""
-    model = model_of(scene)
+def to_loop(scene: Scene, state: State) -> tuple[FloatArray, float]:
+    """A stack's state in its own equations, x (V) and last z (C), (n + 1,), and the gap voltage along the loop, V."""
+    model, y = model_of(scene), state.y.copy()
     if not state.y.any() and not state.s_before.any():
-        return StackState(state.t, state.y.copy(), 0.0, 0.0, 0.0)
+        return y, 0.0
     before, along = float(state.s_before[0]), scene.turn * state.y[:-1]
     u_gap = float(np.einsum("k,k->", along[: model.gap.size], model.gap))
     # If the gap's voltage is no state, it is the source's voltage less the states, whose weights are -1.
     u_gap += 0.0 if model.gap.size and model.gap.max() > 0.0 else before
-    scale, offset, share = 1.0, 0.0, model.k[:-1] * before
+    share = model.k[:-1] * before
+    y[:-1] = along - share
+    # A remainder within the rounding of the capacitive share is no stored charge: an uncharged start gives exactly 0.
+    y[:-1][np.abs(y[:-1]) <= 4e-16 * np.abs(share)] = 0.0
     if model.mobile:
         inverse = inverse_area(abs(u_gap), model.curve)[0]
-        scale, offset = model.area0 * inverse, before / inverse / model.s
-    x = along - share
-    # A remainder within the rounding of the capacitive share is no stored charge: an uncharged start gives exactly 0.
-    x[np.abs(x) <= 4e-16 * np.abs(share)] = 0.0
-    return StackState(state.t, np.append(x / scale, state.y[-1]), before, u_gap, offset)
+        y[:-1] /= model.area0 * inverse
+        y[-1] -= before / inverse / model.s
+    return y, u_gap
 
 
-def from_stack(scene: Scene, state: StackState) -> State:
-    """The state used for all circuits from a state in the engine's form."""
-    model, stack, sign, scale, y = model_of(scene), scene.stack, 0.0, 1.0, state.y.copy()
+def from_loop(scene: Scene, t: float, y: FloatArray, before: float, u_gap: float) -> State:
+    """The state used for all circuits, from that of `to_loop` at time t (s), with `before` (V) around the loop."""
+    model, stack, sign, scale, y = model_of(scene), scene.stack, 0.0, 1.0, y.copy()
     if model.mobile:
-        inverse = inverse_area(abs(state.u_gap), model.curve)[0]
+        inverse = inverse_area(abs(u_gap), model.curve)[0]
         scale = model.area0 * inverse
-        y[-1] += state.u_before / inverse / model.s - state.offset
-        if stack is not None and stack.gap is not None and state.u_gap != 0.0:
-            sign = math.copysign(1.0, state.u_gap) * float(stack.sign[stack.gap])
-    y[:-1] = scene.turn * (model.k[:-1] * state.u_before + scale * y[:-1])
-    return State(state.t, y, np.array([state.u_before]), np.array([sign]), scene.charge_law)
+        y[-1] += before / inverse / model.s
+        if stack is not None and stack.gap is not None and u_gap != 0.0:
+            sign = math.copysign(1.0, u_gap) * float(stack.sign[stack.gap])
+    y[:-1] = scene.turn * (model.k[:-1] * before + scale * y[:-1])
+    return State(t, y, np.array([before]), np.array([sign]), scene.charge_law)
 
 
-def as_marched(scene: Scene, rows: FloatArray, by_layer: bool = True) -> FloatArray:
-    """Voltages of the layers (`Scene.shown`) or all cells along the loop, z and current from rows of `write_row`."""
-    model, stack = model_of(scene), scene.stack
-    x = rows[:, 5:-1] * (model.area0 * rows[:, 2:3]) if model.mobile else rows[:, 5:-1]
-    live = rows[:, :1] * model.k[:-1] + x
-    if by_layer and stack is not None and stack.by_layer is not stack:
-        live = np.einsum("lk,tk->tl", stack.grouping, live)
-    out = np.empty((len(rows), live.shape[1] + 2))
-    out[:, :-2], out[:, -2], out[:, -1] = live, rows[:, -1], rows[:, 3]
-    return out
-
-
-def from_written(scene: Scene, rows: FloatArray, offset: float, by_layer: bool) -> FloatArray:
-    """Rows as in `Record` from rows of `engine.one_area.model.write_row`."""
-    model, out = model_of(scene), as_marched(scene, rows, by_layer)
-    out[:, :-2] *= (scene.shown if by_layer else scene).turn
-    if model.mobile:
-        out[:, -2] += rows[:, 0] / rows[:, 2] / model.s - offset
-    return out
-
-
-def row_width(scene: Scene) -> int:
-    """Number of columns in a row of `engine.one_area.model.write_row`."""
-    return 6 + model_of(scene).gap.size
+def as_shown(scene: Scene, row: FloatArray) -> FloatArray:
+    """A row as in `Record` with a voltage for each layer in place of each cell, as in `Scene.shown`."""
+    if scene.stack is None or scene.shown is scene:
+        return row
+    n = scene.turn.size
+    return np.append(scene.shown.turn * (scene.stack.grouping @ (scene.turn * row[:n])), row[n:])
 
 
 def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> State:
@@ -228,7 +199,7 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
     model = scene.model
     if model is not None and network.gaps[0] is not None and np.any(u):
         # Raised from 0 V, the source has to reach the state's gap voltage.
-        _, x, u_before, u_gap, _ = to_stack(scene, state)
+        (x, u_gap), u_before = to_loop(scene, state), float(before[0])
         k_u, branch = model.k_gap * u_before, choose_branch(model, u_before, x)
         found = float(gap_voltage(model, k_u, float(model.gap @ x[:-1]), branch, k_u))
         # Behind an insulating coating, a gap voltage of 0 V is a difference of other voltages, with their round-off.
@@ -262,8 +233,8 @@ def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
 
 
 # Residual of Kirchhoff's law that rounded decimals of a deck may cause, relative to the largest start voltage; and
-# tolerances of a step towards consistent start voltages, relative to that voltage and to each voltage itself.
-ROUNDING, STEP_ERROR, STEP_RTOL = 1e-12, 1e-14, 2.3e-14
+# tolerance of a step towards consistent start voltages, relative to that voltage, and its stages.
+ROUNDING, STEP_ERROR, STAGES = 1e-12, 1e-14, 7
 PAST_FOLD = "past the fold of the mobile law; allowed: less voltage, more load, or the local law"
 
 
@@ -345,8 +316,8 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[Fl
     n, free = net.k.shape[0], np.isnan(slow)
     area = np.where(free, 1.0, slow)
     for _ in range(61):
-        end = _along(net, u - net.q @ s, s, area)
-        at_end, new = net.p @ end[:n] + net.q @ s, area.copy()
+        end, new = _along(net, u - net.q @ s, s, area), area.copy()
+        at_end = net.p @ end[:n] + net.q @ s
         for i in np.flatnonzero(net.slow >= 0):
             if free[net.slow[i]]:
                 rest = 1.0 / inverse_area(abs(float(at_end[net.gap[i]])), net.curves[i])[0]
@@ -354,59 +325,25 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[Fl
         if np.all(np.abs(new - area) <= 1e-15):
             break
         area = new
-    return end[:n], area, end[n:]
+    return end[:n], area, end[n + slow.size :]
 
 
 def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatArray:
-    """Live voltages (V) and charges (C) where Kirchhoff's residual `off` (n_cell,), V, has fallen to 0 linearly."""
-    n, follows, delayed = net.k.shape[0], np.flatnonzero((net.gap >= 0) & (net.slow < 0)), net.slow >= 0
-    begin = np.zeros(n + net.q.shape[1])
-    if not np.any(off):
-        return begin
-
-    def rate(theta: float, y: FloatArray) -> FloatArray:
-        """Derivative by the homotopy's `theta` in [0, 1], NaN past a fold."""
-        u = net.p @ y[:n] + net.q @ s + (1.0 - theta) * off
-        area, slope = net.area0.copy(), np.zeros(net.area0.size)
-        area[delayed] *= slow[net.slow[delayed]]
-        for i in follows:
-            inverse, change = inverse_area(abs(float(u[net.gap[i]])), net.curves[i])
-            area[i], slope[i] = 1.0 / inverse, -change / inverse**2
-        held = net.c * np.append(area, 1.0)[net.place]
-        met = net.p.T @ (held[:, None] * net.p)
-        x = _solved(met, net.p.T @ (held * off))
-        along = net.p @ x - off
-        current = held * along
-        if net.mobile and follows.size:
-            # The derivatives of the areas add to the capacitance matrix, in the columns of the gaps that they follow.
-            gaps, more = net.gap[follows], np.zeros((net.c.size, follows.size))
-            for column, i, gap in zip(more.T, follows, gaps, strict=True):
-                at = net.place == i
-                # At 0 V the direction of the change decides on the branch.
-                column[at] = (net.c * u)[at] * slope[i] * (np.sign(u[gap]) or np.sign(along[gap]))
-            x = _solved(met + net.p.T @ more @ net.p[gaps], net.p.T @ (held * off + more @ off[gaps]))
-            along = net.p @ x - off
-            current = held * along + more @ along[gaps]
-        return np.concatenate([x, net.through @ current])
-
-    if not follows.size:
-        return rate(0.0, begin)
-    from scipy.integrate import solve_ivp
-
-    scale = np.concatenate([np.ones(n), np.full(net.q.shape[1], math.inf)]) * np.abs(off).max()
-    how = {"first_step": 0.1, "rtol": STEP_RTOL, "atol": STEP_ERROR * scale, "t_eval": [1.0]}
-    with warnings.catch_warnings():
-        # Past a fold the derivative is NaN, of which numpy and scipy would warn; `status` tells of it.
-        warnings.simplefilter("ignore")
-        found = solve_ivp(rate, (0.0, 1.0), begin, "DOP853", **how)
-    if found.status != 0:
-        where = PAST_FOLD if net.mobile else "where no area is left; allowed: less voltage"
-        raise InputError(f"the capacitors' start voltages settle {where}")
-    return np.asarray(found.y[:, -1])
-
-
-def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of a linear system; NaN where its determinant is not positive, as past a fold."""
-    if not np.linalg.slogdet(matrix)[0] > 0.0:
-        return np.full(right.size, math.nan)
-    return np.asarray(np.linalg.solve(matrix, right))
+    """The state where Kirchhoff's residual `off` (n_cell,), V, has fallen to 0 linearly: a jump of one more source."""
+    n, n_s = net.b.shape
+    y, counters, peaks = np.append(np.zeros(n), slow), np.zeros(N_COUNTERS, np.int64), np.zeros(net.gap.size)
+    y = np.append(y, np.zeros(n_s + 1))
+    if np.any(off):
+        wide = net._replace(
+            q=np.column_stack([net.q, off]), b=np.zeros((n, n_s + 1)), through=np.vstack([net.through, 0.0 * off]),
+            delivered=np.zeros((n_s + 1, n + n_s + 1)),
+        )  # fmt: skip
+        size, held = float(np.abs(off).max()), float(np.abs(net.c * np.append(net.area0, 1.0)[net.place]).sum())
+        scale, scheme = np.repeat([size, 1.0, size * held], [n, slow.size, n_s + 1]), radau_scheme(STAGES)
+        work, room = new_work(wide, STAGES, scheme.eigenvalues.size, y.size), new_room(wide, y.size)
+        before, after = np.append(s, 1.0), np.append(s, 0.0)
+        nodal = Nodal(wide, room, scheme, work, ramp(before, after), True, np.zeros(peaks.size), scale, STEP_ERROR)
+        if not pass_jump(nodal, y, before, counters, peaks):
+            where = PAST_FOLD if net.mobile else "where no area is left; allowed: less voltage"
+            raise InputError(f"the capacitors' start voltages settle {where}")
+    return y[:-1]

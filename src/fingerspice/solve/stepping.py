@@ -80,6 +80,7 @@ class Stepping(Integration):
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
         self.branch = np.zeros((0, 2))  # (n, 2): As in `ManyAreas`
         self.out = np.empty((width, self.t_out.size))  # Output rows as columns
+        self.rows = self.out.T
         self.outputs = Outputs(self.t_out, self.left, self.out)
         self.repeated = 0  # Number of periods that were not integrated but repeat another
         self.recorder = Recorder(shown)
@@ -105,9 +106,13 @@ class Stepping(Integration):
         self.fresh = self.fresh or [array.copy() for array in moved]
         for array, first in zip(moved, self.fresh, strict=True):
             array[:] = first
-        self.y[:], self.s_before[:], self.sign[:] = initial.y, initial.s_before, initial.sign
+        self.load(initial)
         self.pace = self.pace._replace(tol=tol)
         self.recorder.parts.clear()
+
+    def load(self, initial: State) -> None:
+        """Take an initial state."""
+        self.y[:], self.s_before[:], self.sign[:] = initial.y, initial.s_before, initial.sign
 
     @property
     def t(self) -> float:

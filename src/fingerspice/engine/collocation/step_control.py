@@ -6,16 +6,14 @@ At a zero of the gap voltage a branch of the area ends: zeros are found from the
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.collocation.readout import Control, series_of
-from fingerspice.engine.network import Segment, source
-from fingerspice.engine.one_area.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp, write_row_at
+from fingerspice.engine.one_area.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp
 from fingerspice.numerics.chebyshev import evaluate, summit
 from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS
 
@@ -77,23 +75,6 @@ def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: C
     take_branch(sign if model.coupled else 1.0, control)
     control.u_gap = u
     return True
-
-
-@jit
-def end_row(
-    model: Model, segment: Segment, tau: float, charge: bool, y: FloatArray, controls: NDArray[Any], row: FloatArray
-) -> None:
-    """Output row (see `model.write_row`) `tau` s into a segment, at 0 after the jump of the source that may begin it.
-
-    The jump's charge is added to `y`, its branch goes into `controls` (1,); the row is NaN where the jump passes a
-    fold.
-    """
-    control = controls[0]
-    u_source, du_source = source(segment, tau)
-    if tau == 0.0 and not enter(model, charge, u_source, y, control):
-        u_source = math.nan
-    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), control.sign, control.u_gap)
-    write_row_at(model, u_source, du_source, y, control.sign, u, row)
 
 
 @jit

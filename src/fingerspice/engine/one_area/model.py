@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.network import Segment, source
+from fingerspice.engine.network import Segment, on_branch, source
 from fingerspice.physics.contact import inverse_area
 
 
@@ -68,19 +68,6 @@ def dot(a: FloatArray, x: FloatArray) -> float:
 
 
 @jit
-def branch_area(model: Model, sign: float, u: float) -> tuple[float, float]:
-    """1/A and its slope d(1/A)/du on the branch A(|u|) = A(sign u), continued a little past 0 V.
-
-    Under `mobile`, beyond this continuation on the wrong side, it is the true area A(|u|), so that `walk` can approach
-    the branch from there. Under `local` there is no such search, and a step across 0 V must see no kink.
-    """
-    if model.mobile and sign * u < model.curve[0]:
-        sign = -sign
-    q, dq = inverse_area(sign * u, model.curve)
-    return q, sign * dq
-
-
-@jit
 def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: float) -> float:
     """Gap voltage (V): k U + x under `local`; under `mobile` the root of u = k U + x A_0 / A(|u|).
 
@@ -90,27 +77,7 @@ def gap_voltage(model: Model, k_u: float, x_gap: float, sign: float, guess: floa
     """
     if not model.mobile or x_gap == 0.0:
         return k_u + x_gap
-    b = x_gap * model.area0
-    u = guess
-    q, dq = branch_area(model, sign, u)
-    last = math.inf
-    for _ in range(12):
-        slope = 1.0 - b * dq
-        # Past the fold Newton's method would go to another root: `walk` decides.
-        if not slope > 1e-3:
-            break
-        step = (k_u - u + b * q) / slope
-        new = u + step
-        q_new, dq_new = branch_area(model, sign, new)
-        if not _rises(b, u, q, dq, q_new, dq_new, step, model.curve[0]):
-            break
-        u, q, dq = new, q_new, dq_new
-        if _settled(step, last, slope, abs(u) + abs(k_u)):
-            if sign * u >= model.curve[0]:
-                return u
-            break
-        last = abs(step)
-    u = walk(model, k_u, b, sign, guess, False)
+    u = walk(model, k_u, x_gap * model.area0, sign, guess, False)
     return u if sign * u >= model.curve[0] else math.nan
 
 
@@ -150,7 +117,7 @@ def walk(model: Model, k_u: float, b: float, sign: float, u: float, stops: bool)
 
     Newton's steps are halved until k_u(u) = u - b / A rises along each (`_rises`). NaN where a fold comes first.
     """
-    q, dq = branch_area(model, sign, u)
+    q, dq = on_branch(model.mobile, model.curve, sign, u)
     slope = 1.0 - b * dq
     last = math.inf
     for _ in range(200):
@@ -167,7 +134,7 @@ def walk(model: Model, k_u: float, b: float, sign: float, u: float, stops: bool)
             new = u + step
             if stops and sign * new < 0.0:
                 new = 0.0
-            q_new, dq_new = branch_area(model, sign, new)
+            q_new, dq_new = on_branch(model.mobile, model.curve, sign, new)
             if _rises(b, u, q, dq, q_new, dq_new, new - u, model.curve[0]):
                 break
             step *= 0.5
@@ -188,7 +155,7 @@ def ramp(model: Model, k_u: float, x_gap: float, u: float) -> float:
     if not model.mobile or not model.coupled or x_gap == 0.0:
         return k_u + x_gap
     b = x_gap * model.area0
-    q, _ = branch_area(model, 1.0, 0.0)
+    q, _ = on_branch(model.mobile, model.curve, 1.0, 0.0)
     # The side of 0 V to which the gap voltage goes from 0 V where the source's share is k_u.
     after = 1.0 if k_u + b * q >= 0.0 else -1.0
     before = after if u == 0.0 else math.copysign(1.0, u)
@@ -202,7 +169,7 @@ def ramp(model: Model, k_u: float, x_gap: float, u: float) -> float:
 @jit
 def turns_at_zero(model: Model, x_gap: float, sign: float) -> bool:
     """Whether the mobile law has a fold at 0 V on the side `sign`: A has a kink there, at which a root may vanish."""
-    _, dq = branch_area(model, sign, 0.0)
+    _, dq = on_branch(model.mobile, model.curve, sign, 0.0)
     return model.mobile and not 1.0 - x_gap * model.area0 * dq > 0.0
 
 
@@ -233,7 +200,7 @@ def voltage_by_time(
     continued analytically through 0 V.
     """
     n = model.gap.size
-    q, dq = branch_area(model, sign, u)
+    q, dq = on_branch(model.mobile, model.curve, sign, u)
     scale = model.area0 * q if model.mobile else 1.0
     rest = 0.0
     total = 0.0
@@ -249,38 +216,6 @@ def voltage_by_time(
     dy[n] = lam / q if model.mobile else (lam + du_source / model.s) / q
     margin = 1.0 - dot(model.gap, y) * model.area0 * dq if model.mobile else 1.0
     return margin, model.k_gap * du_source + dot(model.gap, dy) * model.area0 * q
-
-
-@jit
-def write_row(
-    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, guess: float, row: FloatArray
-) -> None:
-    """Fill one output row: U, gap voltage, 1/A, current, fold margin, then y."""
-    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), sign, guess)
-    write_row_at(model, u_source, du_source, y, sign, u, row)
-
-
-@jit
-def write_row_at(
-    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, u: float, row: FloatArray
-) -> None:
-    """As `write_row`, where the gap voltage u (V) is known."""
-    n = model.gap.size
-    dy = np.empty(n + 1)
-    margin, speed = voltage_by_time(model, u_source, du_source, y, sign, u, dy)
-    q, dq = branch_area(model, sign, u)
-    current = dy[n]
-    if model.mobile:
-        # i = Q' with Q = A U / S + z, and u' from the area equation.
-        current += (du_source / q - dq * speed / margin * u_source / (q * q)) / model.s
-    row[0] = u_source
-    row[1] = u
-    row[2] = q
-    row[3] = current
-    row[4] = margin
-    # A loop, as the assignment to a slice would compile an error message for every shape.
-    for j in range(y.size):
-        row[5 + j] = y[j]
 
 
 @jit
@@ -339,6 +274,16 @@ def _panel_charge(model: Model, x_gap: float, u_from: float, u_to: float) -> tup
 
 
 @jit
+def jump_charges(model: Model, x_gap: float, u_from: float, u_to: FloatArray, out: FloatArray) -> float:
+    """`jump_charge` from one source voltage to each of several, into `out`; the largest error, C."""
+    worst = 0.0
+    for i in range(u_to.size):
+        out[i], error = jump_charge(model, x_gap, u_from, u_to[i])
+        worst = max(worst, error)
+    return worst
+
+
+@jit
 def source_at(
     edges: FloatArray, terms: FloatArray, series: FloatArray, t: FloatArray, left: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
@@ -352,22 +297,3 @@ def source_at(
         segment = Segment(edges[index], edges[index + 1] - edges[index], terms[index], series[index])
         u[i], slope[i] = source(segment, t[i] - edges[index])
     return u, slope
-
-
-@jit
-def follow(model: Model, u: FloatArray, slope: FloatArray, y: FloatArray, u_before: float, rows: FloatArray) -> float:
-    """Fill `rows` (see `write_row`) for source voltages u and slopes, from state y at source voltage `u_before`.
-
-    The charge that flows between two source voltages depends on these two alone, not on the path between them, so that
-    each row is computed from `u_before`. Returns the largest error of the charge, C.
-    """
-    here = y.copy()
-    worst = 0.0
-    for i in range(u.size):
-        if not model.mobile:
-            moved, error = jump_charge(model, dot(model.gap, y), u_before, u[i])
-            here[-1] = y[-1] + moved
-            worst = max(worst, error)
-        sign = choose_branch(model, u[i], here)
-        write_row(model, u[i], slope[i], here, sign, model.k_gap * u[i], rows[i])
-    return worst

@@ -19,10 +19,10 @@ from fingerspice.engine.collocation import exponential, readout, step_control
 from fingerspice.engine.collocation.exponential import Tables, between, largest
 from fingerspice.engine.collocation.readout import N_PLACES, LoopState
 from fingerspice.engine.collocation.step_control import Pace
-from fingerspice.engine.network import Segment, Sources, segment_at, source
+from fingerspice.engine.network import Segment, Sources, on_branch, segment_at, source
 from fingerspice.engine.one_area import rows
 from fingerspice.engine.one_area.charge import charge_step
-from fingerspice.engine.one_area.model import branch_area, dot, turns_at_zero
+from fingerspice.engine.one_area.model import dot, turns_at_zero
 from fingerspice.engine.one_area.rows import DQ, GUESS, SCRATCH, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.one_area.system import System
 from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS, SECOND, THIRD
@@ -124,7 +124,7 @@ def _take_level(c: OneArea, s: LoopState) -> None:
     system, step, error = c.system, s.step[0], s.error
     n, now = system.model.gap.size, 0
     if system.q0.size > 1:
-        q, _ = branch_area(system.model, s.control[0].sign, s.control[0].u_gap)
+        q, _ = on_branch(system.model.mobile, system.model.curve, s.control[0].sign, s.control[0].u_gap)
         now = step_control.nearest_level(system.q0, q)
     if now == step.level:
         return

@@ -24,7 +24,7 @@ from fingerspice.base.compiled import jit
 from fingerspice.engine.one_area.model import Model
 from fingerspice.numerics.chebyshev import evaluate, fit, to_powers
 from fingerspice.numerics.modes import modes
-from fingerspice.physics.contact import N_PACKED, inverse_area_range, ridge_area, ridge_area_array
+from fingerspice.physics.contact import N_PACKED, ridge_area, ridge_area_array
 
 DEGREE = 27
 """Degree of the polynomial for 1/A; if it is not exact enough, a longer Chebyshev series is used."""
@@ -87,7 +87,7 @@ def build_system(
         model.mobile, model.area0, q_range[0], q_range[1], model.rate, model.rate0, model.k, model.gap, model.slow,
         grouping, nodes, ratio,
     )  # fmt: skip
-    return System(model, *forms, *_polynomial(model, tol), float(model.curve[1]), stress)
+    return System(model, *forms, *area_polynomial(model.curve, tol), float(model.curve[1]), stress)
 
 
 @jit
@@ -142,15 +142,6 @@ def _forms(
     return q0, rates, gain, push, own, slowest, tap, tap_k, feed, live, project, shown, k_shown, node, k_node
 
 
-def _polynomial(model: Model, tol: float) -> tuple[FloatArray, FloatArray, float, float]:
-    """1/A as a polynomial of `DEGREE` over the model's own range, where it is good enough."""
-    if model.coupled:
-        return area_polynomial(model.curve, tol)
-    powers = np.zeros(DEGREE + 1)
-    powers[0] = 1.0 / model.area0
-    return powers, np.zeros(DEGREE + 1), 0.0, 1.0
-
-
 def area_error(decade: int) -> float:
     """Relative error allowed of the area's polynomial if an error of that decade is asked for."""
     return max(_AREA_SHARE * 10.0**decade, _AREA_ROUNDING)
@@ -184,22 +175,24 @@ def area_polynomial(curve: FloatArray, tol: float) -> tuple[FloatArray, FloatArr
 
     A polynomial of `DEGREE` in powers if its relative error is at most `tol`; else a longer Chebyshev series.
     """
-    lo, hi = float(curve[0]), float(curve[1])
-    series: FloatArray | None = curve[2 + N_PACKED :]
+    lo, hi, series = float(curve[0]), float(curve[1]), curve[2 + N_PACKED :]
     none = np.zeros(DEGREE + 1), np.zeros(DEGREE + 1), lo, 0.0
+    if series.size == 1:
+        # The area is fixed.
+        return np.append(series, none[0][1:]), none[1], 0.0, 1.0
     if not lo < hi:
         return none
     scale = 2.0 / (hi - lo)
-    if series is not None and series.size and series[0] > 0.0:
+    if series.size and series[0] > 0.0:
         series = series[: _kept(curve, tol)]
         powers, slopes = np.zeros(DEGREE + 1), np.zeros(DEGREE + 1)
         enough = series.size <= DEGREE + 1
         if enough and _to_polynomial(series, powers, slopes, max(2.0 * tol, 4e-15) * _at_rest(curve)):
             return powers, slopes, lo, scale
-    else:
-        series = _long_series(curve, tol)
-    if series is None:
+    elif (found := _long_series(curve, tol)) is None:
         return none
+    else:
+        series = found
     long, slope = _both(series, max(series.size, DEGREE + 2))
     return long, slope, lo, scale
 
@@ -257,11 +250,3 @@ def _to_polynomial(series: FloatArray, powers: FloatArray, slopes: FloatArray, a
             value = value * x + powers[j]
         worst = max(worst, abs(value - evaluate(series, x)[0]))
     return worst <= allowed
-
-
-def area_range(model: Model, u_max: float) -> tuple[float, float]:
-    """Smallest and largest 1/A (1/m^2) for gap voltages up to `u_max` (V)."""
-    if not model.coupled:
-        return 1.0 / model.area0, 1.0 / model.area0
-    least, largest = inverse_area_range(u_max, 17, model.curve)
-    return least, largest

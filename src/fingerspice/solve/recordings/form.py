@@ -43,10 +43,10 @@ from fingerspice.engine.one_area.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
-from fingerspice.solve.collocation import by_modes, on_branch, system_of
+from fingerspice.solve.collocation import by_modes, gap_at, system_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK, Scene
-from fingerspice.solve.starting import StackState
+from fingerspice.solve.starting import from_loop
 from fingerspice.waveforms.samples import Samples
 
 # Number of lanes, each with a piece of a recording.
@@ -113,9 +113,9 @@ class LaneForm(ABC):
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
         """The state at modes as in `start` and `t` (s), where the source has the value `u_last`."""
 
-    @abstractmethod
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
         """Rows of a record from `out` (., n), the values of `rows` and the charges' rates."""
+        return out.T
 
     @cached_property
     def judged(self) -> Shown:
@@ -265,11 +265,11 @@ class StackForm(LaneForm):
         return float(charge + (0.0 if self.mobile else self.rows.bends[-1] * self.bend(np.array([u_gap]))[0]))
 
     def start(self, problem: Problem) -> tuple[FloatArray, float]:
-        start, z = problem.inner, np.zeros(self.lanes.rates.size)
-        z[: start.y.size - 1] = self.system.project[0] @ start.y[:-1]
+        (y, u_gap), z, before = problem.inner, np.zeros(self.lanes.rates.size), float(problem.initial.s_before[0])
+        z[: y.size - 1] = self.system.project[0] @ y[:-1]
         if self.flows:
-            z[self.active] = start.y[-1] - self._rest(z, start.u_gap, start.u_before)
-        return np.append(z, start.u_gap) if self.mobile else z, start.u_before
+            z[self.active] = y[-1] - self._rest(z, u_gap, before)
+        return np.append(z, u_gap) if self.mobile else z, before
 
     def after(self, z: FloatArray, to: float) -> float:
         if not self.mobile:
@@ -278,17 +278,11 @@ class StackForm(LaneForm):
         return float(ramp(model, model.k_gap * to, dot(self.system.gap[0], z), float(z[-1])))
 
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
-        start = problem.inner
-        u_gap = self.xi_at(z, u_last)
-        charge = z[self.active] + self._rest(z, u_gap, u_last) if self.flows else start.y[-1]
-        y = np.append(self.system.live[0] @ z[: start.y.size - 1], charge)
-        found = StackState(t, y, u_last, u_gap, start.offset)
-        return on_branch(problem.scene, self.system.model, found, math.copysign(1.0, u_gap))
-
-    def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        if self.flows and self.mobile:
-            out[self.rows.k.size - 1] -= problem.inner.offset
-        return out.T
+        (y, _), u_gap = problem.inner, self.xi_at(z, u_last)
+        charge = z[self.active] + self._rest(z, u_gap, u_last) if self.flows else y[-1]
+        y = np.append(self.system.live[0] @ z[: y.size - 1], charge)
+        u_gap = gap_at(self.system.model, y, u_last, math.copysign(1.0, u_gap), u_gap)
+        return from_loop(problem.scene, t, y, u_last, u_gap)
 
 
 def rounded_peak(peak: float) -> float:
