@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
@@ -70,6 +70,7 @@ def test_periods_that_have_nothing_in_common_give_none() -> None:
 
 @settings(deadline=None)
 @given(st.integers(5, 400), st.sampled_from([1e3, 5e3, 32e3, 48e3]), st.sampled_from([7.0, 25.0, 30.0, 33.3]))
+@example(12, 1e3, 30.0)
 def test_the_peak_of_a_carrier_is_found_however_its_cycles_fall(eighths: int, carrier: float, envelope: float) -> None:
     peak = fs.AM(150, carrier, envelope).peak(0.0, max(eighths, 8) / 8.0 / envelope)
     assert 0.99 * 150.0 < peak <= 150.0 * (1.0 + 1e-12)

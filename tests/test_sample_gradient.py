@@ -76,6 +76,14 @@ def test_voltages_through_zero_where_the_area_has_a_kink(law: str) -> None:
     check(table1(), noise(3), of, 0.05, 1e-6, charge_law=law, some=slice(None, None, cases(1, 3)))
 
 
+def test_the_stated_error_covers_voltages_through_zero() -> None:
+    for seed in range(4):
+        source = fs.Samples(np.random.default_rng(seed).uniform(-150.0, 150.0, COUNT), RATE)
+        how = {"sources": source, "t_stop": T_STOP, "charge": False}
+        own, finer = (fs.simulate(table1(), rtol=rtol, **how).sample_gradient(f_el_mean=1.0) for rtol in (1e-6, 1e-9))
+        assert np.abs(own.values - finer.values).max() <= own.error
+
+
 def test_a_dispersive_skin(weights: np.ndarray) -> None:
     # Outputs at samples: those between them would need another loop, which takes long to compile.
     at = {"t_eval": np.arange(0, COUNT, 2)[: weights.size] / RATE}

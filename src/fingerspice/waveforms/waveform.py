@@ -167,7 +167,7 @@ class Waveform:
         t = t0 + (t1 - t0) * _SPREAD
         size = np.abs(self.value(t))
         quick = self.shortest_time()
-        if quick < (t1 - t0) / 64.0:
+        if quick < (t1 - t0) / 4.0:
             # A carrier is sampled too coarsely: its amplitude follows from values a quarter of a cycle apart. Look at
             # whole cycles where that is largest.
             amplitude = np.hypot(size, self.value(np.minimum(t + 0.25 * quick, t1)))
