@@ -19,12 +19,12 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along.
-ALL_LINES = 37_201
-ALL_FILES = 131
+ALL_LINES = 36_112
+ALL_FILES = 129
 PACKAGE_LINES = {
-    "base": 1_011, "circuit": 2_125, "cli": 1_550, "engine": 8_276, "explorer": 1_300, "netlist": 2_137,
-    "numerics": 1_166, "physics": 508, "plots": 1_232, "results": 2_551, "sets": 367, "solve": 5_946,
-    "studies": 6_214, "torch": 391, "waveforms": 2_278,
+    "base": 1_010, "circuit": 2_040, "cli": 1_479, "engine": 7_899, "explorer": 1_256, "netlist": 2_072,
+    "numerics": 1_166, "physics": 453, "plots": 1_225, "results": 2_508, "sets": 365, "solve": 5_746,
+    "studies": 6_093, "torch": 387, "waveforms": 2_264,
 }  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.
