@@ -255,7 +255,7 @@ def test_nothing_is_left_in_shared_arrays(right: dict[str, str], monkeypatch: py
     def spoilt(self: Track, *arguments: Any) -> int:
         calls.append(1)
         tables, work = SCRATCH.of(self.system)
-        for array in work:
+        for array in (*work.modal, *(part for part in work if isinstance(part, np.ndarray))):
             array[:] = np.nan
         # Tables of steps may be thrown out at any time.
         tables.h[:] = 0.0

@@ -170,7 +170,9 @@ class Track(Stepping):
             rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s
 
     def row(self, state: State, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
-        return as_shown(self.problem.scene, super().row(state, sources, side))[: len(self.out)]
+        # Past a fold there is no current.
+        row = as_shown(self.problem.scene, super().row(state, sources, side))[: len(self.out)]
+        return np.asarray(np.nan_to_num(row))
 
 
 def gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> float:

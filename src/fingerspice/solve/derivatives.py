@@ -242,9 +242,12 @@ class _Intervals:
     def slopes(self, at: IntArray, rows: BoolArray) -> list[FloatArray]:
         """Derivatives (`_slopes`) of what the intervals `at` lead to, of which `rows` says which are wanted.
 
-        They come twice: as of steps twice as long as the shortest ones, and extrapolated from these.
+        They come twice, for the error: as of long steps, and extrapolated.
         """
-        m, many, allowed, to = self.m, self.h.size > 1, self.run.rtol, self.x[at + 1]
+        m, many, to, zero = self.m, self.h.size > 1, self.x[at + 1], self.xi[at] * self.xi[at + 1] < 0.0
+        # Steps are of third order where the source is a line, but of first order where the gap voltage has a zero: then
+        # the error is all of the difference.
+        allowed = np.where(zero, 1.0, _ALLOWED) * self.run.rtol
         length = self.h[at] if many else self.h
         coarse, fine = (self._slopes(at, to, length, parts) for parts in self.parts[:2])
         # By the modes for what moves them, and by the source relative to the largest one.
@@ -258,11 +261,9 @@ class _Intervals:
                 break
             coarse[..., still] = fine[..., still]
             fine[..., still] = self._slopes(at[still], to[still], length[still] if many else length, parts)
-            off = np.abs(fine[..., still] - coarse[..., still]) > allowed * scale[..., None]
+            off = np.abs(fine[..., still] - coarse[..., still]) > allowed[still] * scale[..., None]
             wanted[..., still] = rows[:, None, None] & off
-        # Steps are of third order where the source is a line, but of first order where the gap voltage has a zero: then
-        # the error is all of the difference.
-        return [coarse, fine + (fine - coarse) / 7.0]
+        return [np.where(zero, coarse, fine), fine + (fine - coarse) / 7.0]
 
     def outputs(self, by: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
         """Derivatives of a number, by its outputs, by the modes (m, n + 1) and the source (n + 1,) at all times."""
@@ -296,9 +297,9 @@ class _Intervals:
             cause = "the run is not followed sample by sample, for its derivatives by samples"
             action = "a higher sample rate takes shorter steps"
             raise SolveError(Failure(Status.STEP_UNDERFLOW, cause, action, float(t[0])))
-        # The modes at all times (m, n + 1), and the distances of their differences (m + 1,).
+        # The modes and xi at all times (m, n + 1), (n + 1,), and the distances of their differences (m + 1,).
         starts = block.kept[:m, :, :-1].reshape(m, -1)[:, : t.size - 1]
-        self.z = np.column_stack([starts, block.end()[:m]])
+        self.z, self.xi = np.column_stack([starts, block.end()[:m]]), block.xi.copy()
         sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
         self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
         of_modes, by_outputs = self.outputs(by)
