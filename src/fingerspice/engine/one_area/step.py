@@ -208,9 +208,8 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
     off[0, n], off[1, n], off[2, n] = between(r[SOURCE])
     # Outputs are read from the polynomial through the gap voltages at the nodes: its interpolation error counts.
     sums[0, 0], sums[0, 1], sums[0, 2] = between(r[U])
-    for p in range(4):
-        sums[1, p] = 0.0
-        sums[2, p] = 0.0
+    sums[0, 3] = 0.0
+    sums[1:] = 0.0
     for k in range(n):
         lin = (gain[k] * off[0, n], gain[k] * off[1, n], gain[k] * off[2, n])
         mode = exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
