@@ -171,8 +171,7 @@ class Track(Stepping):
 
     def row(self, state: State, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
         # Past a fold there is no current.
-        row = as_shown(self.problem.scene, super().row(state, sources, side))[: len(self.out)]
-        return np.asarray(np.nan_to_num(row))
+        return as_shown(self.problem.scene, np.nan_to_num(super().row(state, sources, side)))[: len(self.out)]
 
 
 def gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> float:

@@ -245,8 +245,7 @@ class _Intervals:
         They come twice, for the error: as of long steps, and extrapolated.
         """
         m, many, to, zero = self.m, self.h.size > 1, self.x[at + 1], self.xi[at] * self.xi[at + 1] < 0.0
-        # Steps are of third order where the source is a line, but of first order where the gap voltage has a zero: then
-        # the error is all of the difference.
+        # Steps are of third order, but where the gap voltage has a zero of first order: all of the difference is error.
         allowed = np.where(zero, 1.0, _ALLOWED) * self.run.rtol
         length = self.h[at] if many else self.h
         coarse, fine = (self._slopes(at, to, length, parts) for parts in self.parts[:2])

@@ -274,8 +274,7 @@ class Block:
 
     def _check(self, parts: int) -> _Window:
         """Follow a window of every piece by twice as many steps."""
-        width = self.width
-        lanes = np.arange(PIECES)
+        width, lanes = self.width, np.arange(PIECES)
         off, z, at = np.empty(0), np.empty(0), lanes
         windows = partial(sliding_window_view, window_shape=width + 1, axis=-1)
         for number, place in enumerate(self._windows()):
