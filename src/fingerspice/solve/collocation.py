@@ -170,8 +170,9 @@ class Track(Stepping):
             rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s
 
     def row(self, state: State, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
-        # Past a fold there is no current.
-        return as_shown(self.problem.scene, np.nan_to_num(super().row(state, sources, side)))[: len(self.out)]
+        row = super().row(state, sources, side)
+        row[np.isnan(row)] = 0.0  # Past a fold there is no current.
+        return as_shown(self.problem.scene, row)[: len(self.out)]
 
 
 def gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> float:

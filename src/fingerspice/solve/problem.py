@@ -224,7 +224,9 @@ def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[
     t_out = problem.kept("outputs", lambda: _output_times(problem, jumps), problem.first, problem.step, jumps)
     # Check again, because each jump adds two outputs, of which the first is left-hand.
     check_outputs(problem.circuit, t_out.size)
-    return t_out, t_out == np.append(t_out[1:], np.nan)
+    left = np.zeros(t_out.size, bool)
+    np.equal(t_out[1:], t_out[:-1], out=left[:-1])
+    return t_out, left
 
 
 def _output_times(problem: Problem, jumps: str) -> FloatArray:

@@ -112,8 +112,7 @@ class Block:
         self.lengths = np.full(PIECES, self.count * self.h[0])
         if self.own:
             self.lengths = self.h.reshape(PIECES, self.count).sum(axis=1)
-        # (m, pieces): What is left of the modes at the end of each piece.
-        self.decay = np.exp(-self.rates[:, None] * self.lengths)
+        self.decay = np.exp(-self.rates[:, None] * self.lengths)  # (m, pieces): Left of modes after each piece
 
     def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
         """`engine.lanes.loops.span` from the modes in `kept` at the samples `first`."""

@@ -215,12 +215,11 @@ class LaneMarch:
             flow(form.lanes, by, float(share), x, slope, first, count, kept, xi, own)
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
-        """Write the outputs at the end of the run."""
+        """Write the outputs at the end of the run, with the source's slope after it."""
         count, after = t_out.size - self.outputs, 1e-3 * self.usual
         if count:
             x, slope = np.full(count, self.u_last), np.zeros(count)
             if self.form.flows:
-                # The source's slope after the end of the run.
                 slope += float(np.diff(self.wave.value([self.problem.t_stop, self.problem.t_stop + after]))[0]) / after
             self._show_at(x, slope, np.repeat(self.z[:, None], count, axis=1), out)
 
