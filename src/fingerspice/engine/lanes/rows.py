@@ -367,10 +367,10 @@ def weigh(c: Any, active: int, inner: int, h: FloatArray, weights: FloatArray) -
 
 
 @jit_rows
-def _move(before: FloatArray, after: FloatArray, most: FloatArray) -> None:
+def _move(first: bool, before: FloatArray, after: FloatArray, most: FloatArray) -> None:
     for i in range(most.size):
         move = abs(after[i] - before[i])
-        most[i] = move if move > most[i] else most[i]
+        most[i] = move if first or move > most[i] else most[i]
 
 
 @jit_rows
@@ -387,9 +387,9 @@ def along(
     """Advance modes z (m, lanes) by `count` samples with the area at its reference.
 
     h has the distance (s) from each sample to the next, or one for all. The largest moves of the source in windows
-    of `width` samples go into `moves` (lanes, windows).
+    of `width` samples go into `moves` (windows, lanes).
     """
-    lanes, each, most = first.size, 1 if h.size > 1 else 0, np.zeros(first.size)
+    lanes, each = first.size, 1 if h.size > 1 else 0
     wide = lanes if each else 1
     m, length, rows = np.empty((NODES + 2, wide)), np.full(wide, h[0]), np.empty((z.shape[0], 3, wide))
     before, after = x[first], np.empty(lanes)
@@ -405,8 +405,6 @@ def along(
                 _moments(1, c.rates[k], length, m)
                 _until(wide, c.rates[k], c.gain[k], 1.0, length, m[0], m[1], own[0], own[1], own[2])
             _advanced(lanes, each, own, before, after, z[k])
-        _move(before, after, most)
-        if (t + 1) % width == 0 and t // width < moves.shape[1]:
-            moves[:, t // width] = most
-            most[:] = 0.0
+        if t // width < len(moves):
+            _move(t % width == 0, before, after, moves[t // width])
         before, after = after, before

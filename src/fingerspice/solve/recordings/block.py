@@ -100,7 +100,7 @@ class Block:
         self.first = self.count * np.arange(PIECES)
         # Samples of a window, and the source's largest move in each window of each piece, V.
         self.width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + form.bent))))
-        self.moves = np.empty((PIECES, self.count // self.width))
+        self.moves = np.empty((self.count // self.width, PIECES))
         self.marks, self.active = form.marks(self.own), form.active
         self.rates = np.maximum(form.lanes.rates, _STILL)
         self.room, self.weights = form.room(self.own)
@@ -296,7 +296,7 @@ class Block:
 
     def _windows(self) -> list[IntArray]:
         """Where windows begin in each piece, -1 for none: at large moves of the source, under N at large |xi|, too."""
-        most, width = self.moves, self.width
+        most, width = self.moves.T, self.width
         # Windows end before the last sample.
         most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
         place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
