@@ -40,10 +40,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 #: Folders whose functions compiled code of other files may call.
 SHARED_FOLDERS = ("engine", "numerics", "physics")
 _OWN = Path(__file__).resolve()
-_SOURCES = [
-    _OWN,
-    *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py")),
-]
+_SOURCES = [_OWN, *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py"))]
 #: Hash of the compiled code's sources. By content, so that a package that is copied, or packed into an image, keeps its
 #: compiled code.
 STAMP = hashlib.sha256(b"".join(p.name.encode() + p.read_bytes() for p in _SOURCES)).hexdigest()

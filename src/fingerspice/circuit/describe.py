@@ -211,8 +211,8 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
     named = {name.lower() for name in sources}
     on = [e.name for e in driving if e.name.lower() not in named and e.waveform not in (None, DC(0.0))]
     if on and any(e.name.lower() in named for e in driving):
-        stays = f"{', '.join(on)} stays on, as in the deck; 0 would switch it off"
-        text = f"sources names {', '.join(sources)} only: {stays}"
+        only, stay = ", ".join(sources), ", ".join(on)
+        text = f"sources names {only} only: {stay} stays on, as in the deck; 0 would switch it off"
         warnings.warn(text, FingerspiceWarning, stacklevel=3)
         circuit = dataclasses.replace(circuit, warnings=(*circuit.warnings, text))
     return circuit.replace({circuit[name].name: value for name, value in sources.items()})

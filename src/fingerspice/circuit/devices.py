@@ -242,10 +242,9 @@ def unusual_of_changed(before: Circuit, after: Circuit) -> tuple[dict[str, str],
 
 def concerns(warning: str, changes: Mapping[str, Any]) -> bool:
     """Whether a warning of the reader is about the notation of a value that `changes` now replaces."""
-    subjects = set[str]()
-    for path in map(str.lower, changes):
-        # A warning that names only the source may be about its frequency.
-        subjects |= {path, " ".join(path.rsplit(".", 1)), path.removesuffix(".frequency")}
+    paths = [*map(str.lower, changes)]
+    # A warning that names only the source may be about its frequency.
+    subjects = [*paths, *(" ".join(x.rsplit(".", 1)) for x in paths), *(x.removesuffix(".frequency") for x in paths)]
     return any(f": {subject}: " in warning.lower() for subject in subjects)
 
 

@@ -93,8 +93,7 @@ def shared(circuit: Circuit, key: Any, make: Callable[[], T]) -> T:
     before, found = circuit.related.get(key, (None, None))
     if before is None or not all(map(operator.is_, before, passive)):
         circuit.related[key] = passive, (found := make())
-    kept: T = found
-    return kept
+    return found  # type: ignore[no-any-return]
 
 
 def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
@@ -355,6 +354,8 @@ class Stack:
     @cached_property
     def grouping(self) -> FloatArray:
         """Matrix of 0 and 1 from live cells to recorded layers, shape (n_layer - 1, n_cell - 1)."""
+        if len(self.layers) == self.c.size:
+            return np.eye(self.c.size - 1)
         layers = np.array(self.by_layer.state_order[:-1], int)
         return np.asarray(layers[:, None] == self.layer_of[np.array(self.state_order[:-1], int)], float)
 

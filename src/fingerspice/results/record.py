@@ -64,7 +64,7 @@ class Sealed:
         for value in vars(self).values():
             for array in value.values() if isinstance(value, dict) else (value,):
                 if isinstance(array, np.ndarray):
-                    array.flags.writeable = False
+                    array.setflags(write=False)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

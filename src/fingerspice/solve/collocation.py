@@ -120,8 +120,7 @@ class Track(Stepping):
         self.capacitance = float(model.slow[-3]) * model.area0
         super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown)
         self.error = np.zeros(n + 1)
-        self.control["branch_length"] = np.inf
-        self.control["margin"] = 1.0
+        self.control["branch_length"], self.control["margin"] = np.inf, 1.0
         self.load(problem.initial)
         self.look_for_period(self.system.rates, np.ones(n), repeat)
 

@@ -199,12 +199,14 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
 
     Recordings have no jumps, so that rounding changes nothing.
     """
-    if all(isinstance(wave, Samples | DC) for wave in problem.waveforms):
+    if all(isinstance(wave, (Samples, DC)) for wave in problem.waveforms):
         return t
     span, moved = (problem.t_start, problem.t_stop), t
     windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
     for w0, w1 in itertools.pairwise(span if windows == 1 else np.linspace(*span, windows + 1)):
         edges = problem.breakpoints() if windows == 1 else problem.waveform.breakpoints(w0, w1)
+        if not edges.size:
+            continue
         reach = same_time(1.0) * np.abs(edges)
         first = t.searchsorted(edges - reach)
         near = np.flatnonzero(np.abs(t.take(first, mode="clip") - edges) <= reach)

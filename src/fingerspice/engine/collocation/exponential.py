@@ -194,10 +194,8 @@ def _make_tables(tables: Tables, rates: FloatArray, level: int, h: float) -> int
         if tables.h[slot] == h and tables.level[slot] == level:
             return slot
     slot = int(count[0] % slots)
-    count[0] += 1
     # A count beyond the slots tells only that all are in use and which is next: it is kept below twice their number.
-    if count[0] >= 2 * slots:
-        count[0] -= slots
+    count[0] = count[0] + 1 if slot + 1 < slots else slots
     tables.h[slot] = h
     tables.level[slot] = level
     phi, miss = tables.phi[slot], tables.miss[slot]
@@ -217,9 +215,9 @@ def between(values: FloatArray) -> tuple[float, float, float]:
     second = 0.0
     third = 0.0
     for j in range(NODES):
-        first += BETWEEN[j, 0] * values[j]
-        second += BETWEEN[j, 1] * values[j]
-        third += BETWEEN[j, 2] * values[j]
+        first += BETWEEN[0, j] * values[j]
+        second += BETWEEN[1, j] * values[j]
+        third += BETWEEN[2, j] * values[j]
     return values[FIRST] - first, values[SECOND] - second, values[THIRD] - third
 
 
@@ -279,19 +277,24 @@ def carry(circuit: Any, state: Any, gap: FloatArray, answer: float) -> None:
     x, error, slot = circuit.work.modal, state.error, state.step[0].slot
     base, used, off, shifted, other = x.spare[0], x.spare[1], x.spare[2], x.spare[3], x.spare[4]
     decay, phi, carried, w = circuit.tables.decay[slot], circuit.tables.phi[slot], x.carried, x.w
-    largest_u, reach = largest_size(x.u.ravel()), 0.0
+    largest_u, reach = 0.0, 0.0
+    for a in range(gap.shape[0]):
+        largest_u = max(largest_u, largest_size(x.u[a]))
     for k in range(w.shape[0]):
+        for p in range(4):
+            carried[k, p] = decay[k, FIRST + p if p < 3 else END] * error[k]
         for a in range(gap.shape[0]):
             # A slow area is a mode behind the others, in units of its area at 0 V.
             reach = max(reach, abs((gap[a, k] if k < gap.shape[1] else largest_u) * error[k]))
     shift = _SHIFT * largest_u
-    answers = answer > _SLIGHT and 0.0 < shift / reach < math.inf
-    scale = shift / reach if answers else 1.0
+    if not (answer > _SLIGHT and 0.0 < shift / reach < math.inf):
+        return
+    scale = shift / reach
     for k in range(w.shape[0]):
         for i in range(ROWS):
             off[k, i] = base[k, i] = scale * decay[k, i] * error[k]
             used[k, i] = 0.0
-    for iteration in range(_PASSES if answers else 0):
+    for iteration in range(_PASSES):
         _add(w, 1.0, off, shifted)
         if not _probe(circuit, state, shifted, other):
             break
@@ -301,20 +304,15 @@ def carry(circuit: Any, state: Any, gap: FloatArray, answer: float) -> None:
         if not move > _ENOUGH * shift:
             break
     for k in range(w.shape[0]):
-        for p in range(3):
-            carried[k, p] = off[k, NODES + p] / scale
-        carried[k, 3] = off[k, END] / scale
-
-
-# Three numbers, at the points between the nodes.
-Three = tuple[float, float, float]
+        for p in range(4):
+            carried[k, p] = off[k, FIRST + p if p < 3 else END] / scale
 
 
 @jit_within
 def mode_error(
-    x: Modal, k: int, lin: Three, tables: Tables, slot: int, rows: tuple[int, int, int, int], magnified: float,
-    error: float, off: FloatArray,
-) -> Three:  # fmt: skip
+    x: Modal, k: int, lin: tuple[float, float, float], tables: Tables, slot: int, rows: tuple[int, int, int, int],
+    magnified: float, error: float, off: FloatArray,
+) -> tuple[float, float, float]:  # fmt: skip
     """Fill `places` with the errors of mode k at a step's start, the points between its nodes, and its end.
 
     They are the interpolation error of the forcing, of which `lin` is that of the linear part; the residual of the
@@ -333,23 +331,18 @@ def mode_error(
 
 
 @jit_rows
-def node_error(
-    node: FloatArray, node_s: FloatArray, places: FloatArray, off: FloatArray, error: FloatArray
-) -> float:  # fmt: skip
+def node_error(node: FloatArray, node_s: FloatArray, places: FloatArray, off: FloatArray) -> float:
     """Largest error of any node's voltage over a step (V), from that of the modes and the sources.
 
     `off` (N_PLACES, m + n_s) has the interpolation errors of the sources behind those of the modes, and in its last row
-    those of the modes at the start; `error` (m, ROWS) is scratch.
+    those of the modes at the start.
     """
-    m, n, worst = places.shape[0], node.shape[1], 0.0
-    for k in range(n):
-        for p in range(N_PLACES):
-            error[k, p] = places[k, p] + (off[4, k] if p == 0 else 0.0)
-    for i in range(node.shape[0]):
-        for p in range(N_PLACES):
+    m, worst = places.shape[0], 0.0
+    for p in range(N_PLACES):
+        for i in range(node.shape[0]):
             total = 0.0
-            for k in range(n):
-                total += node[i, k] * error[k, p]
+            for k in range(node.shape[1]):
+                total += node[i, k] * (places[k, p] + (off[4, k] if p == 0 else 0.0))
             if 0 < p < N_PLACES - 1:
                 for e in range(node_s.shape[1]):
                     total += node_s[i, e] * off[p - 1, m + e]

@@ -147,17 +147,17 @@ def series_of(values: FloatArray, out: FloatArray) -> None:
         out[d] = total
 
 
-@jit
+@jit_rows
 def basis_at(theta: float, basis: FloatArray) -> None:
     """Basis polynomials at fraction `theta` of the step, into `basis` (NODES,): values there are basis @ values."""
-    total = 0.0
     for j in range(NODES - 1, -1, -1):
-        distance = theta - POINTS[j]
-        if distance == 0.0:
+        if theta == POINTS[j]:
             basis[:] = 0.0
             basis[j] = 1.0
             return
-        basis[j] = BARYCENTRIC[j] / distance
+    total = 0.0
+    for j in range(NODES):
+        basis[j] = BARYCENTRIC[j] / (theta - POINTS[j])
         total += basis[j]
     for j in range(NODES):
         basis[j] /= total
@@ -304,13 +304,12 @@ def account(
 
     `run` holds the errors of the voltage at the places, V, and `area_off` is the relative error of the area beside it.
     """
-    force = 0.0
+    peak, error, force, moved = peaks[PEAK_U], peaks[ERROR_U], 0.0, 0.0
     for i in range(NODES):
         if POINTS[i] <= theta:
             size = abs(u[i])
-            peaks[PEAK_U] = max(peaks[PEAK_U], size)
+            peak = max(peak, size)
             force = max(force, stress * size * size * area[i])
-    moved = 0.0
     for p in range(N_PLACES):
         steepest = 0.0
         for i in range(_NEAR[p][0], _NEAR[p][1] + 1):
@@ -318,7 +317,8 @@ def account(
                 # F ~ u^2 A: an error du changes F by at most 2 F du / u, because the area falls with |u|.
                 steepest = max(steepest, 2.0 * stress * abs(u[i]) * area[i])
         moved = max(moved, run[p] * steepest)
-        peaks[ERROR_U] = max(peaks[ERROR_U], run[p])
+        error = max(error, run[p])
+    peaks[PEAK_U], peaks[ERROR_U] = peak, error
     peaks[PEAK_F] = max(peaks[PEAK_F], force)
     peaks[ERROR_F] = max(peaks[ERROR_F], moved + area_off * force)
 

@@ -457,7 +457,7 @@ def _account(c: ManyAreas, s: LoopState) -> None:
             readout.account(
                 x.u[a], areas[forms.AREA, a], form.stress[a], s.step[0].theta, x.run[a], area_off, s.peaks[a]
             )  # fmt: skip
-    v_error = exponential.node_error(form.node, form.node_s, x.places, work.off, x.spare[0])
+    v_error = exponential.node_error(form.node, form.node_s, x.places, work.off)
     s.peaks[-1, readout.ERROR_U] = max(s.peaks[-1, readout.ERROR_U], v_error)
 
 

@@ -137,10 +137,11 @@ def _powers_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, sig
         x = (sign * u[i] - lo) * scale - 1.0
         # Outside the range any finite value will do: a step that needs it is rejected.
         x = min(max(x, -1.0), 1.0)
-        value = powers[DEGREE]
-        for d in range(DEGREE - 1, -1, -1):
-            value = value * x + powers[d]
-        out[i] = value
+        # Two sums in powers of x^2, as in a single one every product would wait for the last.
+        square, odd, even = x * x, powers[DEGREE], powers[DEGREE - 1]
+        for d in range(DEGREE - 2, 0, -2):
+            odd, even = odd * square + powers[d], even * square + powers[d - 1]
+        out[i] = odd * x + even
 
 
 @jit

@@ -124,7 +124,9 @@ def _take_level(c: OneArea, s: LoopState) -> None:
     system, step, error = c.system, s.step[0], s.error
     n, now = system.model.gap.size, 0
     if system.q0.size > 1:
-        q, _ = on_branch(system.model.mobile, system.model.curve, s.control[0].sign, s.control[0].u_gap)
+        q = s.control[0].last_q
+        if step.fresh == step_control.AFTER_EDGE or not q > 0.0:
+            q, _ = on_branch(system.model.mobile, system.model.curve, s.control[0].sign, s.control[0].u_gap)
         now = step_control.nearest_level(system.q0, q)
     if now == step.level:
         return
@@ -280,8 +282,7 @@ def _node_error(c: OneArea, level: int) -> float:
     system, r, w, places = c.system, c.work.r, c.work.modal.w, c.work.modal.places
     node, k_node, gap, area0 = system.node[level], system.k_node, system.gap[level], system.model.area0
     if not system.model.mobile:
-        by_source = k_node.reshape((k_node.size, 1))
-        return exponential.node_error(node, by_source, places, c.work.off, c.work.modal.spare[0])
+        return exponential.node_error(node, k_node[:, np.newaxis], places, c.work.off)
     own, missed, values = np.zeros((places.shape[0], N_PLACES)), np.zeros(N_PLACES), np.zeros(ROWS)
     moved = np.zeros(N_PLACES)
     for p in range(N_PLACES):
@@ -368,7 +369,8 @@ def _account(c: OneArea, s: LoopState) -> None:
     control.magnified = max(control.magnified, step.grown)
     for i in range(ROWS):
         r[SCRATCH, i] = 1.0 / r[Q, i]
-        if model.mobile and model.coupled and i < NODES and POINTS[i] <= step.theta:
+    for i in range(NODES if model.mobile and model.coupled else 0):
+        if POINTS[i] <= step.theta:
             control.margin = min(control.margin, 1.0 - model.area0 * r[X_GAP, i] * r[DQ, i])
     readout.account(r[U], r[SCRATCH], c.system.stress, step.theta, c.work.modal.run[0], 0.0, s.peaks[0])
     s.peaks[1, readout.ERROR_U] = max(s.peaks[1, readout.ERROR_U], _node_error(c, step.level))
@@ -382,7 +384,7 @@ def _move(c: OneArea, charge: bool, s: LoopState) -> None:
     readout.end_at(step.theta, x, s.error)
     if charge:
         y[-1] = readout.at(x.values[system.shown.shape[1]], x.basis)
-        control.last_q = readout.at(r[Q], x.basis)
+    control.last_q = readout.at(r[Q], x.basis)
     control.u_gap = 0.0 if step.crossed >= 0 else readout.at(r[U], x.basis)
     apply(system.live[step.level], x.w0, y)
 

@@ -152,7 +152,7 @@ class Block:
             self.margin = min(margins[-2:])
             if stops:
                 break
-            off = self.kept[:active, :, -1] - np.roll(starts[:active], -1, axis=1)
+            off = self.kept[:active, :, -1] - np.append(starts[:active, 1:], starts[:active, :1], axis=1)
             change = self._handed_on(off, np.zeros(active))[:, :-1]
             self.left[:active] = np.abs(change).max(axis=1)
             most = float(np.abs(form.lanes.shape) @ self.left)
