@@ -12,7 +12,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
-from fingerspice.engine.collocation.readout import N_PLACES, Modal
+from fingerspice.engine.collocation.readout import Modal
 from fingerspice.engine.many_areas.form import evaluate_many, probe_many
 from fingerspice.engine.one_area.rows import evaluate_one, largest_size, probe_one
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
@@ -338,13 +338,19 @@ def node_error(node: FloatArray, node_s: FloatArray, places: FloatArray, off: Fl
     those of the modes at the start.
     """
     m, worst = places.shape[0], 0.0
-    for p in range(N_PLACES):
-        for i in range(node.shape[0]):
-            total = 0.0
-            for k in range(node.shape[1]):
-                total += node[i, k] * (places[k, p] + (off[4, k] if p == 0 else 0.0))
-            if 0 < p < N_PLACES - 1:
-                for e in range(node_s.shape[1]):
-                    total += node_s[i, e] * off[p - 1, m + e]
-            worst = max(worst, abs(total))
+    for i in range(node.shape[0]):
+        start, first, second, third, end = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(node.shape[1]):
+            share = node[i, k]
+            start += share * (places[k, 0] + off[4, k])
+            first += share * places[k, 1]
+            second += share * places[k, 2]
+            third += share * places[k, 3]
+            end += share * places[k, 4]
+        for e in range(node_s.shape[1]):
+            share = node_s[i, e]
+            first += share * off[0, m + e]
+            second += share * off[1, m + e]
+            third += share * off[2, m + e]
+        worst = max(worst, abs(start), abs(first), abs(second), abs(third), abs(end))
     return worst

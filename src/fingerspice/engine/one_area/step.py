@@ -209,9 +209,8 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
     mobile, area0, places, n = system.model.mobile, system.model.area0, x.places, x.w0.size
     off[0, n], off[1, n], off[2, n] = between(r[SOURCE])
     # Outputs are read from the polynomial through the gap voltages at the nodes: its interpolation error counts.
+    sums[:] = 0.0
     sums[0, 0], sums[0, 1], sums[0, 2] = between(r[U])
-    sums[0, 3] = 0.0
-    sums[1:] = 0.0
     for k in range(n):
         lin = (gain[k] * off[0, n], gain[k] * off[1, n], gain[k] * off[2, n])
         mode = exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
@@ -220,8 +219,7 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
             sums[2, p] += gap[k] * places[k, p + 1]
         for p in range(3):
             places[k, p + 1] += mode[p]
-    worst, magnified = 0.0, 1.0
-    run[0] = 0.0
+    worst, magnified, run[0] = 0.0, 1.0, 0.0
     for p in range(4):
         row = FIRST + p if p < 3 else END
         factor = 1.0
@@ -394,8 +392,7 @@ def _cross(c: OneArea, s: LoopState) -> bool:
     """Change the branch at a zero of the gap voltage, which ends a step; False at a fold there."""
     step, control, model, t_new = s.step[0], s.control[0], c.system.model, s.step[0].t_new
     control.sign = -control.sign
-    control.branch_length = t_new - control.branch_start
-    control.branch_start = t_new
+    control.branch_length, control.branch_start = t_new - control.branch_start, t_new
     s.counters[readout.ZEROS] += 1
     if turns_at_zero(model, dot(model.gap, s.y), control.sign):
         control.t = t_new
