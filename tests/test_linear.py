@@ -236,17 +236,17 @@ def test_the_points_between_see_what_the_nodes_miss_in_the_ratio_of_miss() -> No
     # x^13 is missed by the node polynomial times the scale of its highest coefficient, and nothing else.
     x = 2.0 * POINTS - 1.0
     missed = chebyshev.chebval(x, np.eye(NODES + 1)[NODES])
-    seen = missed[FIRST:] - missed[:NODES] @ BETWEEN.T
+    seen = missed[FIRST:] - missed[:NODES] @ BETWEEN
     np.testing.assert_allclose(seen / MISS, seen[0] / MISS[0], rtol=1e-12)
     assert abs(MISS[1]) == np.abs(MISS).max() == pytest.approx(1.0, rel=1e-14)
     # The next few orders have zeros elsewhere: no mixture of three of them is small at all points.
     higher = chebyshev.chebval(x, np.eye(NODES + 3)[NODES:].T)
-    seen = higher[:, FIRST:] - higher[:, :NODES] @ BETWEEN.T
+    seen = higher[:, FIRST:] - higher[:, :NODES] @ BETWEEN
     assert np.linalg.svd(seen, compute_uv=False).min() > 0.1
 
 
 def test_values_between_nodes_and_series_are_exact_up_to_the_nodes_degree() -> None:
     values = chebyshev.chebval(2.0 * POINTS - 1.0, np.eye(NODES))
-    np.testing.assert_allclose(values[:, :NODES] @ BETWEEN.T, values[:, FIRST:], rtol=0, atol=2e-15)
+    np.testing.assert_allclose(values[:, :NODES] @ BETWEEN, values[:, FIRST:], rtol=0, atol=2e-15)
     # The last columns fill a vector.
     np.testing.assert_allclose(values[:, :NODES] @ TO_SERIES, np.eye(*TO_SERIES.shape), rtol=0, atol=5e-15)

@@ -12,6 +12,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -245,8 +246,9 @@ _RECORDED, _FILLED = 100, 0.01
 _CLOCK, _OTHER_UNIT = 1e8, 20.0
 # Largest number of samples of a spectrum; and of periods over which a skin's data at one frequency are judged.
 _MOST_SAMPLES, _PERIODS = 2**17, 16
-# Number of pieces that represent a long run of a source without period, and of frequencies of gains.
-_PIECES, _GRID = 4, 49
+# Number of pieces that represent a long run of a source without period; frequencies of gains, Hz; and Hann's windows.
+_PIECES, _GRID = 4, np.geomspace(*SKIN_BAND, 49)
+_window = lru_cache(maxsize=8)(np.hanning)
 # Least length (s) of a piece of a recording, two periods of the lowest frequency of the skin's data; and the number of
 # samples up to which straight lines between them are looked at instead.
 _LEAST, _FEW = 2.0 / SKIN_BAND[0], 4096
@@ -391,7 +393,7 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
         pieces = 1 if span * rate <= _MOST_SAMPLES else _PIECES
     count = _enough(span, rate) // pieces
     length = span if pieces == 1 else count / rate
-    window = 1.0 if periodic is not None else np.hanning(count)
+    window = 1.0 if periodic is not None else _window(count)
     total: FloatArray = np.zeros(1)
     for start in np.linspace(t0, t0 + span - length, pieces).tolist():
         u = _samples(waveform, start, start + length, count)
@@ -413,7 +415,7 @@ def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | 
         # A power of two, as the Fourier transform of a number with a large prime factor takes many times as long.
         count = min(2 ** int(math.log2(last)), 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
         starts = np.unique(np.linspace(0, last - count, min(_PIECES, math.ceil(last / count))).astype(int))
-        total, window = np.zeros(count // 2 + 1), np.hanning(count)
+        total, window = np.zeros(count // 2 + 1), _window(count)
         for i in starts.tolist():
             lines = np.fft.rfft(wave.between(i, i + count) * window)
             total += lines.real**2 + lines.imag**2
@@ -456,14 +458,13 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     at rest and the source's spectrum over the run to `t_stop` (s); of several fingers the largest error counts. Outside
     the band of the skin's data the response at the band's ends is used. None if the response cannot be computed.
     """
-    grid = np.geomspace(*SKIN_BAND, _GRID)
 
     def squared_gains() -> list[FloatArray] | None:
-        """Of each gap (n_gap, _GRID), with the skin's own data at each frequency and with those held at one."""
+        """Of each gap (n_gap, _GRID.size), with the skin's own data at each frequency and with those held at one."""
         networks = network_of(circuit), network_of(with_skin_held(circuit))
         gaps, areas = [gap for gap in networks[0].gaps if gap is not None], networks[0].areas_at_rest
         try:
-            return [np.abs(n.phasors(grid, areas, np.ones(1, complex)).T[gaps]) ** 2 for n in networks]
+            return [np.abs(n.phasors(_GRID, areas, np.ones(1, complex)).T[gaps]) ** 2 for n in networks]
         except np.linalg.LinAlgError:
             return None
 
@@ -472,12 +473,11 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     if squares is None or f.size < 2:
         return None
     # Gains between those of the grid are interpolated in log f, beyond its ends they are those of the ends.
-    place, known = np.log(np.maximum(f, SKIN_BAND[0])), np.log(grid)
+    place, known = np.log(np.maximum(f, SKIN_BAND[0])), np.log(_GRID)
     right, held = (np.array([energy @ np.interp(place, known, row) for row in square]) for square in squares)
     if not (right.size and np.all(right > 0.0) and np.all(np.isfinite(held / right))):
         return None
-    errors = held / right - 1.0
-    return float(errors[np.argmax(np.abs(errors))])
+    return float(max(held / right - 1.0, key=abs))
 
 
 def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> Iterator[str]:

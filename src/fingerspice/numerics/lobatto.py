@@ -52,8 +52,8 @@ BARYCENTRIC = 1.0 / np.array([np.prod(4.0 * (x - np.delete(_X, i))) for i, x in 
 _BETWEEN = np.array([0.5 * (_X[i] + _X[i + 1]) for i in (0, 5, 9)])
 POINTS = np.concatenate([_X, _BETWEEN])
 """Fractions of the step, shape (ROWS,)."""
-BETWEEN = np.ascontiguousarray(_lagrange(_BETWEEN, _X, BARYCENTRIC))
-"""Interpolation from the nodes to the points between, shape (3, NODES)."""
+BETWEEN = np.ascontiguousarray(_lagrange(_BETWEEN, _X, BARYCENTRIC).T)
+"""Interpolation from the nodes to the points between, shape (NODES, 3)."""
 DERIVATIVE = np.zeros((NODES, NODES))
 """Differentiation matrix: slope at each node, per step length, of the polynomial through values at the nodes."""
 for _i in range(NODES):

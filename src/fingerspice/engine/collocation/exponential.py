@@ -215,9 +215,9 @@ def between(values: FloatArray) -> tuple[float, float, float]:
     second = 0.0
     third = 0.0
     for j in range(NODES):
-        first += BETWEEN[0, j] * values[j]
-        second += BETWEEN[1, j] * values[j]
-        third += BETWEEN[2, j] * values[j]
+        first += BETWEEN[j, 0] * values[j]
+        second += BETWEEN[j, 1] * values[j]
+        third += BETWEEN[j, 2] * values[j]
     return values[FIRST] - first, values[SECOND] - second, values[THIRD] - third
 
 

@@ -166,7 +166,7 @@ def form_of(c: Any, s: Any) -> Form:
 
 
 # From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
-TO_RATES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN @ DERIVATIVE]).T)
+TO_RATES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN.T @ DERIVATIVE]).T)
 
 
 @jit_rows

@@ -21,7 +21,7 @@ from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POIN
 # scene 7391 of tests/stress.py.
 LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
 # Differentiation matrix for the points between the nodes, shape (3, NODES).
-_DERIVATIVE_BETWEEN = BETWEEN @ DERIVATIVE
+_DERIVATIVE_BETWEEN = np.ascontiguousarray(BETWEEN.T @ DERIVATIVE)
 
 
 @jit_within
@@ -206,7 +206,7 @@ def _missed(
         off = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, FIRST + p] + v * scale)
         slope = 0.0
         for j in range(NODES):
-            off -= BETWEEN[p, j] * rate[j]
+            off -= BETWEEN[j, p] * rate[j]
             slope += _DERIVATIVE_BETWEEN[p, j] * voltage[j]
         if not model.mobile and model.coupled:
             off += slow[n + 1] / h * (1.0 / q - 1.0 / r[Q, 0]) * slope
