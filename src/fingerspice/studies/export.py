@@ -20,7 +20,7 @@ from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
 from fingerspice.waveforms.periodic import PWL, Pulse
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import DC, Exp, Sine, Waveform, require
+from fingerspice.waveforms.waveform import DC, Exp, Sine, Waveform, refuse, require
 
 EDGE = 1e-9
 """Rise time (s) of an ideal jump in the export, since ngspice has none; a thousandth of TSTEP if that is shorter."""
@@ -240,6 +240,5 @@ def _points(w: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.nd
 
 
 def _refuse_many(points: float, name: str) -> None:
-    if points > _MOST:
-        raise InputError(f"{name}: the source would take {points:.0f} PWL points; allowed: at most {_MOST}; "
-                         "shorten the run (--stop, or .tran)")  # fmt: skip
+    allowed = f"at most {_MOST}; shorten the run (--stop, or .tran)"
+    refuse(points > _MOST, f"{name}: the source would take {points:.0f} PWL points; allowed: {allowed}")

@@ -380,9 +380,8 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Wavef
     refuse(not found.names, f"'{path}' has no header; allowed: a first line such as 'time (s), friction (N)'")
     kinds = [name.lower() for name in found.names]
     named = [kind for kind in ("force", "friction") if kind in kinds]
-    if len(named) != 1:
-        has = "columns force and friction" if named else "no column named force or friction"
-        raise InputError(f"'{path}' has {has}; it has {found.listed()}; allowed: one column of these names")
+    has = "columns force and friction" if named else "no column named force or friction"
+    refuse(len(named) != 1, f"'{path}' has {has}; it has {found.listed()}; allowed: one column of these names")
     values = found.scaled(kinds.index(named[0]), "N")
     refuse(values.size < 2, f"'{path}' has one row; allowed: two or more")
     timed = next((i for i, name in enumerate(kinds) if name in ("t", "time")), None)

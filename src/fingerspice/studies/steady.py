@@ -33,7 +33,7 @@ from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.runs import Progress
 from fingerspice.solve.simulation import rtol_given, run_problem
-from fingerspice.waveforms.waveform import Fundamental, Sine, require
+from fingerspice.waveforms.waveform import Fundamental, Sine, refuse, require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -380,9 +380,8 @@ def large_signal(
     require_circuit(circuit)
     scene = linear_scene(circuit, finger)
     driving = scene.network.drives
-    if len(driving) != 1:
-        names = ", ".join(e.name for e, _ in driving)
-        raise InputError(f"a large-signal sweep drives one source, and this circuit has {names}")
+    names = ", ".join(e.name for e, _ in driving)
+    refuse(len(driving) != 1, f"a large-signal sweep drives one source, and this circuit has {names}")
     own = sweep_drive(driving, scene.network.waveforms[0].fundamental, swept=True)
     if amplitude is None and math.isnan(own[0]):
         raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")

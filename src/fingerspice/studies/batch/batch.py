@@ -25,7 +25,7 @@ from fingerspice.results.solution import MEANS, Solution
 from fingerspice.solve.simulation import RTOL_RANGE, rtol_given, simulate
 from fingerspice.studies.batch.lockstep import LOCKSTEP, Ladder, LockstepForm, Slopes, lockstep_form, why_alone
 from fingerspice.studies.steady import steady_state
-from fingerspice.waveforms.waveform import Sum, require
+from fingerspice.waveforms.waveform import Sum, refuse, require
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 #: Signals whose figures a batch has, and the kinds of figures.
 SIGNALS_OF_BATCH = ("f_el", "f_t", "friction", "u_gap", "area")
 _KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
+# The signal and the kind of every output.
+_OUTPUTS = {f"{signal}_{kind}": (signal, kind) for signal in SIGNALS_OF_BATCH for kind in _KINDS}
+_OUTPUTS["u_gap"] = "u_gap", ""
 LEAST_RTOL = 1e-12
 ONE_BY_ONE, REFUSED, FAILED = 1, 2, 3
 STATUS_NAMES = ("lockstep", "one_by_one", "refused", "failed")
@@ -74,25 +77,24 @@ class Task:
         require(self.points % 2 == 0, "points", self.points, "an even number, 2 or more")
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in self.outputs:
-            if name not in ("u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)):
+            if name not in _OUTPUTS:
                 kinds, signals = ", ".join(f"_{kind}" for kind in _KINDS), ", ".join(SIGNALS_OF_BATCH)
                 raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
         require(bool(self.outputs), "outputs", "empty", "one or more names")
         self.traced = "u_gap" in self.outputs
         # Gap voltages stay on the processor.
         self.device = "cpu" if self.traced else device
-        if periods is not None and t_stop is not None:
-            raise InputError("t_stop and periods are both given; allowed: one of them")
+        given = [x for x in (t_stop, periods) if x is not None]
+        refuse(len(given) == 2, "t_stop and periods are both given; allowed: one of them")
         self.t_stop = None if t_stop is None else positive_number("t_stop", t_stop, "s")
         self.periods = None if periods is None else positive_number("periods", periods)
-        if periodic and (periods is not None or t_stop is not None):
-            raise InputError("periodic=True takes one period, and t_stop or periods is given; allowed: neither")
+        refuse(periodic and given, "periodic=True takes one period, and t_stop or periods is given; allowed: neither")
         if periodic:
             self.periods = 1.0
-        elif periods is None and t_stop is None:
+        elif not given:
             if circuit.tran is None:
-                raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or "
-                                 "periods")  # fmt: skip
+                missing = "no t_stop: the deck has no .tran line and none was given"
+                raise InputError(f"{missing}; give t_stop in s, or periods")
             self.t_stop = circuit.tran.stop
         # Parameters by which the means are differentiated, in the circuit's spelling, each with those that grow in
         # proportion to it: a source's frequency with that of a skin
@@ -119,9 +121,8 @@ class Task:
         moved = any(f"{e.name}.frequency" in self.scenes for e in on)
         period = None if of_skin or moved or not on else Sum(tuple(waves)).period
         if period is None:
-            raise InputError(f"{len(on)} sources have a period; allowed: one, where periods, u_gap or the skin's "
-                             "frequency follow it, or several of fixed frequencies in a ratio of whole "
-                             "numbers")  # fmt: skip
+            allowed = "one, where periods, u_gap or the skin's frequency follow it, or several of fixed frequencies"
+            raise InputError(f"{len(on)} sources have a period; allowed: {allowed} in a ratio of whole numbers")
         return np.full(self.n, 1.0 / period)
 
 
@@ -138,9 +139,9 @@ def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dic
         require(name not in given, name, "given twice", "once")
         given[name] = array
     sizes = {path: array.size for path, array in given.items() if array.ndim == 1}
-    if len(set(sizes.values())) > 1:
-        raise InputError(f"the arrays have {', '.join(f'{n} ({p})' for p, n in sizes.items())} values; allowed: equal "
-                         "lengths, or single numbers")  # fmt: skip
+    counts = ", ".join(f"{n} ({path})" for path, n in sizes.items())
+    unequal = len(set(sizes.values())) > 1
+    refuse(unequal, f"the arrays have {counts} values; allowed: equal lengths, or single numbers")
     n = max(sizes.values(), default=1)
     scenes = {path: np.ascontiguousarray(np.broadcast_to(array, (n,))) for path, array in given.items()}
     for path, array in scenes.items():
@@ -185,8 +186,7 @@ def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None
     if not paths:
         return None
     outputs = tuple(name for name in task.outputs if name in MEANS)
-    if not outputs:
-        raise InputError(f"gradients are asked for, and outputs has no mean; allowed: one of {', '.join(MEANS)}")
+    refuse(not outputs, f"gradients are asked for, and outputs has no mean; allowed: one of {', '.join(MEANS)}")
     if (number := len(circuit.by_device("GAP"))) != 1:
         raise InputError(f"gradients are asked for, and the circuit has {number} GAPs; allowed: one")
     require(len(set(paths)) == len(paths), "gradients", repr(paths), "every parameter once")
@@ -204,9 +204,8 @@ def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None
             name, moved = path.rpartition(".")[0], circuit.varied({path: value * (1.0 + _SEEN)})
             own, other = circuit[name].waveform, moved[name].waveform
             turned = own is not None and other is not None and own.tone() != other.tone()
-        if turned:
-            raise InputError(f"skin='follow', and gradients names {path}, with which the skin's frequency changes; "
-                             "allowed: the frequency of the only source, or skin='own'")  # fmt: skip
+        said = f"skin='follow', and gradients names {path}, with which the skin's frequency changes"
+        refuse(turned, f"{said}; allowed: the frequency of the only source, or skin='own'")
     asked = copy(task)
     asked.outputs, asked.traced, asked.scenes, asked.clock = outputs, False, scenes, clock if clock in paths else None
     asked.paths = {path: (path, *(skins if path == clock else ())) for path in paths}
@@ -291,9 +290,9 @@ def batch(
     if skin == "follow":
         frequency = task.frequencies(of_skin=True)
         for element in skins:
-            if f"{element.name}.f" in scenes:
-                raise InputError(f"skin='follow' and {element.name}.f are both given; allowed: one of them")
-            task.scenes[f"{element.name}.f"] = frequency
+            own_data = f"{element.name}.f"
+            refuse(own_data in scenes, f"skin='follow' and {own_data} are both given; allowed: one of them")
+            task.scenes[own_data] = frequency
     for text in scenes_warnings(circuit, task.t_stop, scenes, skin):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     slopes, form = gradients_of(task, gradients, skin), lockstep_form(circuit, task.scenes)
@@ -406,13 +405,11 @@ def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> t
     if paths:
         # The error of a change by all of the parameter is about ten times that of the run.
         return {name: _slopes_of(task, circuit, run, name, stop) for name in task.outputs}, Slopes.limit * error
-    values = {}
-    for name in task.outputs:
-        signal = _signal_of(name)
-        value = run.u_gap if name == "u_gap" else run._figures.value(signal, name[len(signal) + 1 :])
-        values[name] = np.asarray(math.nan if value is None else value, float)
-        if name == "u_gap":
-            values[name] = np.atleast_1d(values[name])[: -1 if task.periodic else None]
+    # What there is not is None, and so NaN.
+    asked = [name for name in task.outputs if name != "u_gap"]
+    values = {name: np.asarray(run._figures.value(*_OUTPUTS[name]), float) for name in asked}
+    if task.traced:
+        values["u_gap"] = np.atleast_1d(np.asarray(run.u_gap, float))[: -1 if task.periodic else None]
     return values, error
 
 
@@ -430,10 +427,6 @@ def _slopes_of(task: Task, circuit: Circuit, run: Solution, name: str, stop: flo
     return np.array([x / known[path].value for path, x in by.items()])
 
 
-def _signal_of(output: str) -> str:
-    return next(signal for signal in SIGNALS_OF_BATCH if output.startswith(signal))
-
-
 def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], skin: str, device: str) -> Dataset:
     """The answers with the values given, `scenes`, as coordinates, and units."""
     from xarray import Dataset
@@ -442,9 +435,10 @@ def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], 
     meanings = {"flag_values": list(range(len(STATUS_NAMES))), "flag_meanings": " ".join(STATUS_NAMES)}
     data: dict[str, Any] = {}
     for name in task.outputs:
-        signal, dims = _signal_of(name), ("scene", "turn", "gap") if name == "u_gap" else ("scene", "gap")
-        unit = "deg" if name.endswith("phase_deg") else SIGNALS[signal][0]
-        text, values = f"{SIGNALS[signal][1]}{name[len(signal) :]}", task.values[name]
+        signal, kind = _OUTPUTS[name]
+        dims, values = ("scene", "gap") if kind else ("scene", "turn", "gap"), task.values[name]
+        unit = "deg" if kind == "phase_deg" else SIGNALS[signal][0]
+        text = name.replace(signal, SIGNALS[signal][1], 1)
         data[name] = (dims[: values.ndim], values, {"units": unit, "long_name": text})
     data["error"] = ("scene", task.error, {"units": "1", "long_name": "stated error, relative"})
     data["status"] = ("scene", task.status, meanings)

@@ -63,10 +63,9 @@ _PARTS = (2, 16)
 _COVERED = 1.2, 1.8
 # Allowed defect of the periodic state relative to rtol, and that of a run from rest that ends when it has settled.
 _CLOSING, _SETTLED = 0.02, 0.05
-# Longest first step after a jump of a square, and longest step at all of a run whose source is not 0 V at its start, in
-# time constants of the fastest cell; and the voltage at the start that counts as 0 V, over all tones. Also from
-# there a leaking gap's voltage jumps, as it leads the source: below this rtol the first step is as short as a square's.
-_LONGEST_STEP, _FROM_ZERO, _LEADING = 1.0, 1e-12, 5e-5
+# Voltage at the start of a run, over all tones, that counts as 0 V. Also from there a leaking gap's voltage jumps, as
+# it leads the source: below this rtol the first step is as short as a square's.
+_FROM_ZERO, _LEADING = 1e-12, 5e-5
 # Number by which the first step of a square, with so many steps a piece, is shorter than the fastest cell's time
 # constant; and the largest number of pieces.
 _PIECE_START, _MOST_PIECES = 2, 20
@@ -104,11 +103,6 @@ class LockstepForm:
     frequency: float | None
     jumping: bool  # Whether the source is a square
     recording: Samples | None  # The samples of the only source, if it is a recording
-
-    @property
-    def cells(self) -> int:
-        """Number of cells of all layers."""
-        return self.stack.c.size
 
 
 def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str:
@@ -212,11 +206,11 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
         recorded = None if form.recording is None else [(0.0, peak_of(form.recording), 0.0)]
         for _, amplitude, phase in recorded or _tones_of(element.waveform, values(element))[0]:
             rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
-    n, others, cell = next(iter(scenes.values())).size, CELL_ROWS * form.cells, 0
+    n, others, cell = next(iter(scenes.values())).size, CELL_ROWS * form.stack.c.size, 0
     out = np.empty((others + len(rows), n))
     for i, row in enumerate(rows, others):
         out[i] = row
-    of_cells = out[:others].reshape(CELL_ROWS, form.cells, n)
+    of_cells = out[:others].reshape(CELL_ROWS, form.stack.c.size, n)
     for layer, count in zip(form.stack.layers, form.stack.cells, strict=True):
         assert layer.spec.cells is not None
         cells = layer.spec.cells(values(layer), None)
@@ -304,7 +298,7 @@ class Ladder:
         self.needed = sorted({i for name in self.names for i in FIGURES[name.removesuffix("_periodic")]} or {0})
         self.n_moment = ALL_MOMENTS if self.needed[-1] else 1
         # What the scenes need of their steps, each of shape (n,); first, whether there is contact
-        table, periodic, cells, others = self.table, task.periodic, form.cells, CELL_ROWS * form.cells
+        table, periodic, cells, others = self.table, task.periodic, form.stack.c.size, CELL_ROWS * form.stack.c.size
         self.possible = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
         # Leakage rate of every cell with its area at rest; the largest is an upper bound of the rates of the modes.
         leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
@@ -325,8 +319,9 @@ class Ladder:
             size = np.hypot(tones[::2], tones[1::2]).sum(axis=0)
             from_zero = abs(tones[1::2].sum(axis=0)) <= _FROM_ZERO * size
             first = np.where(from_zero, START_TIMES[2] if task.rtol < _LEADING else 0.0, 1.0)
-        # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
-        self.least = 2.0 * first * self.decays / _LONGEST_STEP
+        # Least number of steps a period (sample); else 0. The first step after a jump of a square, and every step of a
+        # run whose source is not 0 V at its start, lasts for a time constant of the fastest cell or less.
+        self.least = 2.0 * first * self.decays
 
     def climb(self, halves: int) -> None:
         """Find what is wanted in runs of so many half periods; scenes whose error stays too large stay not done."""
@@ -400,7 +395,7 @@ class Ladder:
         assert form.stack.gap is not None
         devices = [form.stack.layers[i].device for i in form.stack.layer_of]
         leaks: IntArray = np.array([i for i, device in enumerate(devices) if device in ("LAYER", "GAP")])
-        lengths = form.cells - 1, waves[1].shape[1], leaks.size, level.degree + 1, self.n_moment
+        lengths = form.stack.c.size - 1, waves[1].shape[1], leaks.size, level.degree + 1, self.n_moment
         marks, scenes = marks_of(*lengths), (self.table, columns, (form.stack.gap, leaks), curves)
         block = new_block(self.table.shape[0], level.pieces, marks)
         if form.recording is not None:
@@ -423,7 +418,7 @@ class Ladder:
         signal, kind = name.removesuffix("_periodic").rsplit("_", 1)
         if signal == "u_gap":
             return np.asarray(np.sqrt(m[2]))
-        others, gap = self.table[CELL_ROWS * self.form.cells :], self.form.gap
+        others, gap = self.table[CELL_ROWS * self.form.stack.c.size :], self.form.gap
         load, stress = others[LOAD, columns], others[STRESS, columns]
         if signal == "f_el":
             return np.asarray(stress * (m[0] if kind == "mean" else np.sqrt(m[1])))
@@ -472,7 +467,7 @@ class Ladder:
         more = self.task.traced | (2.0 * decays > _STIFF * level.steps) | (self.least[pending] > decays)
         share: FloatArray | float = np.where(more, _STATED_MORE, _STATED)
         if self.form.recording is not None:
-            share = _STATED_RECORDED if self.form.cells == len(self.form.stack.layers) else _STATED_DISPERSIVE
+            share = _STATED_RECORDED if self.form.stack.c.size == len(self.form.stack.layers) else _STATED_DISPERSIVE
         elif self.form.jumping:
             share = _STATED_JUMPING
         return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING + 2.0**level.degree * _EPS)
@@ -495,7 +490,6 @@ class Slopes(Ladder):
     highest_degree = 16
     gives_up = False
     named = "gradients: "
-    unmet = "what does not end after half periods, or does not meet its error in lockstep"
 
     def __init__(self, task: Task, form: LockstepForm, members: IntArray) -> None:
         super().__init__(task, form, members)

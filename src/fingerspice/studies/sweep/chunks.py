@@ -286,13 +286,11 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
                 scheduler = held.enter_context(cluster).scheduler_address
             client = held.enter_context(distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False))
         except (OSError, ValueError, ImportError, RuntimeError) as error:
-            raise InputError(
-                f"no scheduler answers at {scheduler} ({type(error).__name__}); allowed: the address that "
-                "`dask scheduler` tells, such as tcp://10.0.0.1:8786"
-                if workers is None
-                else f"the workers did not start ({type(error).__name__}); in a script, allowed: workers under "
-                "if __name__ == '__main__'"
-            ) from None
+            fault, hint = "the workers did not start", "in a script, allowed: workers under if __name__ == '__main__'"
+            if workers is None:
+                fault = f"no scheduler answers at {scheduler}"
+                hint = "allowed: the address that `dask scheduler` tells, such as tcp://10.0.0.1:8786"
+            raise InputError(f"{fault} ({type(error).__name__}); {hint}") from None
         yield client
 
 

@@ -19,7 +19,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.studies.batch.batch import REFUSED, batch, own_path
-from fingerspice.waveforms.waveform import Waveform, require
+from fingerspice.waveforms.waveform import Waveform, refuse, require
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -64,9 +64,8 @@ class Plan:
             else:
                 circuit, self.names[kind], self.own[kind] = _together(circuit, kind, asked[kind])
         rest = [name for name in asked if name in self.names or name not in sets.KINDS]
-        if not rest:
-            raise InputError(f"parameters is {dict(asked)!r}, and nothing varies; allowed: a list of sets, an array or "
-                             "a distribution beside it")  # fmt: skip
+        allowed = "a list of sets, an array or a distribution beside it"
+        refuse(not rest, f"parameters is {dict(asked)!r}, and nothing varies; allowed: {allowed}")
         self.circuit = circuit  # With the values that named sets give to every scene
         self.grid, self.drawn, self.fixed = dict[str, FloatArray](), dict[str, Any](), dict[str, FloatArray]()
         known, taken = circuit.parameters, Counter[str]()
@@ -111,10 +110,9 @@ class Plan:
     def spread(self, grid: Mapping[str, FloatArray], draws: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Values of each path in all scenes of a part of the grid with a part of the draws, shape (n_scene,)."""
         count = next(iter(draws.values())).size if draws else 1
-        mesh = np.meshgrid(*grid.values(), indexing="ij")
-        places = mesh[0].size if mesh else 1
-        flat = {path: np.repeat(values.ravel(), count) for path, values in zip(grid, mesh, strict=True)}
-        return self.paths(self.fixed | flat | {path: np.tile(values, places) for path, values in draws.items()})
+        *mesh, draw = (x.ravel() for x in np.meshgrid(*grid.values(), np.arange(count), indexing="ij"))
+        drawn = {path: values[draw] for path, values in draws.items()}
+        return self.paths(self.fixed | dict(zip(grid, mesh, strict=True)) | drawn)
 
     def quantiles(self, points: FloatArray) -> dict[str, FloatArray]:
         """Values of the drawn parameters at points of the unit cube, shape (n_point, n_drawn)."""
@@ -244,9 +242,8 @@ def sweep(
 
         plan = Plan(circuit, parameters, n, seed, MOST_STORED_SAMPLES)
         return stored(plan, options, Path(store), workers, scheduler, shard)
-    if workers is not None or scheduler is not None or tuple(shard) != (1, 1):
-        raise InputError("workers, scheduler or shard is given without store; allowed: a folder such as "
-                         "'out/sweep.zarr'")  # fmt: skip
+    useless = workers is not None or scheduler is not None or tuple(shard) != (1, 1)
+    refuse(useless, "workers, scheduler or shard is given without store; allowed: a folder such as 'out/sweep.zarr'")
     from xarray import Dataset
 
     plan = Plan(circuit, parameters, n, seed, MOST_SAMPLES)
