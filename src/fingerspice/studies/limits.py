@@ -190,13 +190,11 @@ def capability(
 
 
 class _Search:
-    """Search for the largest forces, of up to `most` (N), whose inverse drive stays within the voltage limit.
-
-    For a series stack the inverter's drive is exact. The peak of another network's is off by `ratio`, which changes
-    little from a force to the next, so that few drives have to be corrected by forward runs.
-    """
+    """Search for the largest forces, of up to `most` (N), whose inverse drive stays within the voltage limit."""
 
     def __init__(self, finger: Finger, limit: float, carrier: float | None, most: float) -> None:
+        # The inverter's drive is exact for a series stack. The peak of another network's is off by a ratio, which
+        # changes little from a force to the next, so that few drives have to be corrected by forward runs.
         self.finger, self.limit, self.carrier, self.ratio = finger, limit, carrier, 1.0
         self.rate = _PER_CARRIER * carrier if carrier is not None else _LEAST_RATE
         self.voltages = finger.voltages(most, self.rate, carrier)
@@ -343,9 +341,8 @@ def fold_limits(
     require_circuit(circuit)
     points, span = grid_of(points, span)
     gaps = circuit.by_device("GAP")
-    if len(gaps) != 1:
-        found = ", ".join(g.name for g in gaps) or "none"
-        raise InputError(f"a map of the fold needs one GAP whose area follows it; this circuit has {found}")
+    found = ", ".join(g.name for g in gaps) or "none"
+    refuse(len(gaps) != 1, f"a map of the fold needs one GAP whose area follows it; this circuit has {found}")
     if circuit.tran is None:
         raise InputError("a map of the fold needs a .tran line that says how long a run is")
     sources, t_stop = circuit.by_device("V"), circuit.tran.stop

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,9 +60,9 @@ class Data:
     values: FloatArray  # (n,): Measured values in SI units: means, or, with `t`, values over time
     sigma: FloatArray | None  # (n,): Standard deviation of every value; None where it is not known
     conditions: dict[str, FloatArray]  # (n,): Values of parameters by path, in the unit of the netlist
-    t: FloatArray | None = None  # (n,): Times, s
-    phase: FloatArray | None = None  # (n,): Phase of an impedance, deg
-    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)  # (n,): The group of each, by column
+    t: FloatArray | None  # (n,): Times, s
+    phase: FloatArray | None  # (n,): Phase of an impedance, deg
+    groups: dict[str, tuple[str, ...]]  # (n,): The group of each, by column
 
     @property
     def name(self) -> str:
@@ -137,15 +137,14 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
     least = math.inf if sigma is None else sigma.min(initial=math.inf)
     refuse(least <= 0.0, f"{place}: the smallest sigma is {least:g}; allowed: more than 0")
     conditions: dict[str, FloatArray] = {}
-    data = Data(names[name], values, sigma, conditions, t, phase, groups)
-    if t is not None:
-        wrong = name.endswith("_mean") or np.any(np.diff(t) <= 0.0)
-        refuse(wrong, f"{place} have the column t; allowed: rising times, with a signal that is no mean")
     for column, x in columns.items():
         path = _path(circuit, column)
         refuse(path in conditions, f"{place} have two columns of {path}; allowed: one")
         conditions[path] = x
+    data = Data(names[name], values, sigma, conditions, t, phase, groups)
     if t is not None:
+        wrong = name.endswith("_mean") or np.any(np.diff(t) <= 0.0)
+        refuse(wrong, f"{place} have the column t; allowed: rising times, with a signal that is no mean")
         refuse(data.varying, f"{place} have times and changing conditions; allowed: one run over time, or means")
         refuse(groups, f"{place} have times and groups; allowed: groups of means or of impedances")
     return data
@@ -295,7 +294,7 @@ class Fit(FitResult):
     predicted: FloatArray
     sigma: FloatArray
     objectives: tuple[float, ...]
-    circuits: dict[str, Circuit] = field(default_factory=dict)
+    circuits: dict[str, Circuit]
 
     @property
     def residual(self) -> FloatArray:
@@ -325,10 +324,10 @@ class Fit(FitResult):
         # What changed most stands along the axis, and every value of the rest has a curve.
         varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
         axes = [(meaning_of(circuit, path), circuit.parameters[path].unit, x) for path, x in varying]
-        if data.t is not None:
-            axes = [("time", "s", data.t)]
         numbers = np.arange(1.0, data.values.size + 1.0, dtype=np.float64)
-        (label, unit, x), *others = axes or [("measurement", "", numbers)]
+        # Conditions that vary go without times.
+        alone = ("measurement", "", numbers) if data.t is None else ("time", "s", data.t)
+        (label, unit, x), *others = axes or [alone]
         groups = data.groups.items() if varying else ()
         keys = [[f"{column} = {one}" for one in of] for column, of in groups]
         keys += [[f"{name} = {y:g} {unit}".rstrip() for y in values] for name, unit, values in others]

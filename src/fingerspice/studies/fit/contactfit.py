@@ -83,8 +83,7 @@ def _relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, 
         place = "the data" if len(several) == 1 else f"data {number}"
         columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
         measured = [name for name in MEASURED if name in columns]
-        said = f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}"
-        refuse(not measured, said)
+        refuse(not measured, f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
         alone = len(measured) == 1 and SIGMA in columns
         sigmas = {name: SIGMA if alone else f"{name}_{SIGMA}" for name in measured}
         unknown = [name for name in columns if name not in (*measured, *CONDITIONS, *sigmas.values())]

@@ -292,7 +292,7 @@ class FitResult(Shown):
     evaluations: int
     closed: bool
     notes: tuple[str, ...]
-    profiles: dict[str, Profile] = field(default_factory=dict)
+    profiles: dict[str, Profile]
 
     @classmethod
     def _reported(

@@ -377,8 +377,7 @@ def _weights(f: FloatArray, y: ComplexArray, poles: FloatArray) -> tuple[FloatAr
     columns = np.column_stack([np.ones_like(s), s, *(s / (s + p) for p in poles)]) / y[:, None]
     matrix = np.vstack([columns.real, columns.imag])
     size = np.linalg.norm(matrix, axis=0)
-    x, _ = nnls(matrix / size, np.concatenate([np.ones(f.size), np.zeros(f.size)]))
-    x = x / size
+    x = nnls(matrix / size, np.concatenate([np.ones(f.size), np.zeros(f.size)]))[0] / size
     return x, columns @ x - 1.0
 
 
