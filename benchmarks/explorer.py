@@ -110,7 +110,7 @@ def memory(count: int) -> dict[str, float]:
         _, _, host, token, _ = url.split("/")
         with contextlib.closing(http.client.HTTPConnection(host)) as connection:
             for i in range(count + 1):
-                request = {"deck": EXAMPLES[0].deck, "overrides": {"Xgap.d": 3e-6 + 1e-10 * i}, "last": 2}
+                request = {"deck": EXAMPLES[0]["request"]["deck"], "overrides": {"Xgap.d": 3e-6 + 1e-10 * i}, "last": 2}
                 connection.request("POST", f"/{token}/scene", json.dumps(request))
                 connection.getresponse().read()
                 if i in (count // 100, count // 10, count // 2, count):

@@ -154,7 +154,7 @@ def test_the_gallery_has_every_deck_and_every_scene(monkeypatch: pytest.MonkeyPa
     monkeypatch.syspath_prepend(str(DOCS))
     gallery = importlib.import_module("gallery")
     entries = {entry.name: entry for _, entry, _ in gallery.entries()}
-    decks, scenes = CIRCUITS.glob("*.cir"), (f"scene-{example.name}" for example in EXAMPLES)
+    decks, scenes = CIRCUITS.glob("*.cir"), (f"scene-{example['name']}" for example in EXAMPLES)
     assert set(entries) == {*(path.stem for path in decks), *scenes}
     assert all(f"]({name}.png)" in gallery.page() for name in entries)
     assert "where fingers feel best" in entries["click"].about
@@ -197,7 +197,7 @@ def test_the_command_draws_decks_and_scenes(tmp_path: Path, command: Command, mo
     result = command("figures", "--gallery", "--out", "out")
     assert result.code == 0
     drawn = {path.stem for path in (tmp_path / "out" / "gallery").glob("*.png")}
-    assert drawn == {"click", *(f"scene-{one.name}" for one in some)}
+    assert drawn == {"click", *(f"scene-{one['name']}" for one in some)}
     assert all(name in result.out for name in drawn)
     result = command("figures", "--gallery", "--only", "4")
     assert result.code == 2

@@ -35,8 +35,8 @@ from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from scenes import DECKS, cases, listed
 
 ROOT = Path(__file__).parents[1]
-SINE = EXAMPLES[0].deck
-BY_NAME = {e.name: e for e in EXAMPLES}
+SINE = EXAMPLES[0]["request"]["deck"]
+BY_NAME = {e["name"]: e["request"] for e in EXAMPLES}
 OWN = (DECKS / "own.cir").read_text()
 
 
@@ -159,16 +159,16 @@ def test_the_values_of_a_scene_are_those_of_simulate(explorer: Explorer) -> None
     np.testing.assert_allclose(friction["amplitude"], lines.amplitude)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda e: e.name)
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda e: e["name"])
 def test_every_example_shows_what_it_promises(example: Any) -> None:
-    answer = scene({"deck": example.deck, **example.asked})
-    if example.name == "fold":
+    answer = scene(example["request"])
+    if example["name"] == "fold":
         assert (answer["ok"], answer["status"]) == (False, "FOLD")
         assert "no solution" in answer["message"]
         assert 0.0 < answer["failed_at"] < 1e-3
         assert answer["sliders"]
         # It fails before the periods that are shown, so that all there is of it is shown instead.
-        shown = scene({"deck": example.deck, **example.asked, "last": 2})
+        shown = scene({**example["request"], "last": 2})
         assert shown["status"] == "FOLD"
         assert shown["t"].size > POINTS // 2
         assert 0.99 * answer["failed_at"] < shown["t"][-1] <= answer["failed_at"]
@@ -183,14 +183,14 @@ def test_every_example_shows_what_it_promises(example: Any) -> None:
     # No peak is missed between the points of the source's curve.
     shown, largest = np.abs(answer["traces"][0]["values"]).max(), answer["figures"][0]
     assert shown >= 0.98 * max(abs(largest["max"]), abs(largest["min"]))
-    fingers = 2 if example.name == "two-fingers" else 1
+    fingers = 2 if example["name"] == "two-fingers" else 1
     assert len([t for t in answer["traces"] if t["signal"] == "f_el"]) == len(answer["stacks"]) == fingers
-    assert ".tran" in as_deck({"deck": example.deck, **example.asked})
+    assert ".tran" in as_deck(example["request"])
 
 
 @pytest.mark.parametrize("kind", WAVEFORMS)
 def test_every_waveform_of_the_menu_runs_as_the_menu_writes_it(kind: str) -> None:
-    numbers = " ".join(f"{a.value:g}" for a in WAVEFORMS[kind][1])
+    numbers = " ".join(f"{a['value']:g}" for a in WAVEFORMS[kind]["arguments"])
     request = {"deck": SINE, "source": f"Vdrive={kind}({numbers})", "rtol": 1e-4, "periods": 2, "skin": "dispersive"}
     if kind == "RECORDING":
         request["recording"] = {"name": "a.wav", "rate": 1e3, "values": packed([0.0, 1.0, 0.0, -1.0, 0.0])}
@@ -202,9 +202,9 @@ def test_every_waveform_of_the_menu_runs_as_the_menu_writes_it(kind: str) -> Non
 
 def test_sliders_show_every_parameter_within_its_range_and_say_what_they_move() -> None:
     assert len(BY_NAME) == len(EXAMPLES) >= 12
-    answer = scene({"deck": BY_NAME["ungrounded"].deck, "overrides": {"Xgap.d": "4u"}})
+    answer = scene({"deck": BY_NAME["ungrounded"]["deck"], "overrides": {"Xgap.d": "4u"}})
     sliders = {s["path"]: s for group in answer["sliders"] for s in group["sliders"]}
-    circuit = fs.parse_netlist(BY_NAME["ungrounded"].deck)
+    circuit = fs.parse_netlist(BY_NAME["ungrounded"]["deck"])
     assert set(sliders) == set(circuit.parameters)
     assert sliders["Xgap.d"]["value"] == 4e-6
     assert sliders["Xgap.d"]["text"] == "4u"
@@ -213,7 +213,7 @@ def test_sliders_show_every_parameter_within_its_range_and_say_what_they_move() 
         assert slider["low"] < slider["high"], slider
         assert slider["value"] is None or slider["low"] <= slider["value"] <= slider["high"], slider
         assert not slider["log"] or slider["low"] > 0.0, slider
-    unmoved = scene({"deck": BY_NAME["ungrounded"].deck})
+    unmoved = scene({"deck": BY_NAME["ungrounded"]["deck"]})
     ranges = {s["path"]: (s["low"], s["high"]) for group in unmoved["sliders"] for s in group["sliders"]}
     assert ranges == {path: (s["low"], s["high"]) for path, s in sliders.items()}
     for name, spec in DEVICES.items():
@@ -323,7 +323,7 @@ def test_a_recording_is_the_source_that_its_file_gives(tmp_path: Path, monkeypat
         file.setparams((1, 2, 8000, 400, "NONE", ""))
         file.writeframes(values.tobytes())
     (tmp_path / "a.csv").write_text("t,u\n0,0\n1e-3,100\n4e-3,-50\n")
-    deck = BY_NAME["click"].deck
+    deck = BY_NAME["click"]["deck"]
     recording = {"name": "a.wav", "rate": 8000, "values": packed(list(values / 2.0**15))}
     table = {"name": "a.csv", "times": packed([0.0, 1e-3, 4e-3]), "values": packed([0.0, 100.0, -50.0])}
     for gain, data, stop in ((150.0, recording, 0.05), (2.0, table, 4e-3)):

@@ -18,7 +18,7 @@ from scenes import CIRCUITS
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")
 CHROMIUM = shutil.which("chromium")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-SINE = fs.parse_netlist(EXAMPLES[0].deck)
+SINE = fs.parse_netlist(EXAMPLES[0]["request"]["deck"])
 
 
 @pytest.fixture(scope="module")

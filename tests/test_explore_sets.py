@@ -17,7 +17,7 @@ from fingerspice.explorer.scene import EXAMPLES, applied, as_python, before, sce
 from fingerspice.explorer.server import framed
 from test_explore import baked, run_as_python
 
-DECKS = {example.name: example.deck for example in EXAMPLES}
+DECKS = {example["name"]: example["request"]["deck"] for example in EXAMPLES}
 SINE, FINGERS = DECKS["sine"], DECKS["two-fingers"]
 
 

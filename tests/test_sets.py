@@ -424,7 +424,7 @@ def test_the_sets_are_listed_and_shown(command: Command) -> None:
 
 @pytest.mark.parametrize(("example", "name"), [("wet", "moist"), ("dry", "dry")])
 def test_the_fingers_of_the_explorer_are_those_of_the_sets(example: str, name: str) -> None:
-    decks = {one.name: one.deck for one in EXAMPLES}
+    decks = {one["name"]: one["request"]["deck"] for one in EXAMPLES}
     assert values(fs.parse_netlist(decks[example])) == values(with_set(name, fs.parse_netlist(decks["sine"])))
 
 

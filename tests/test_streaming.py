@@ -349,7 +349,7 @@ def test_a_damaged_store_is_refused(few: Command) -> None:
     piece.write_bytes(piece.read_bytes()[:-8])
     said = few(*FEW)
     assert said.code == 2
-    assert f"{PATH} is damaged: {piece} is missing or cut short; allowed: --overw" in said.lines[-1]
+    assert f"{PATH} is damaged: {piece} is missing or cut short; allowed: a run with --overw" in said.lines[-1]
     head.write_bytes(head.read_bytes()[:200])
     said = few(*FEW, "--overwrite")
     assert said.code == 2

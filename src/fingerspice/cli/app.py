@@ -215,8 +215,7 @@ def plan(
     circuit, _ = with_times(job.read(), job.stop)
     result = fs.plan(circuit, charge_law=job.charge_law, area=area_from_text(area), rtol=job.rtol, charge=charge)
     found = result.to_dict()
-    job.answer.update(**{key: found[key] for key in terminal.OWN["plan"] if key in found and key != "area"})
-    job.answer.update(plan_area=result.area)
+    job.answer.update(plan_area=found.pop("area"), **found)
     job.give(lambda: "\n".join([*head_lines(circuit), "", str(result)]))
 
 

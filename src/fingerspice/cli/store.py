@@ -26,8 +26,8 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import settle_on_disk, write_aside, write_durably
 from fingerspice.circuit.describe import digests
 from fingerspice.cli.options import Job, check_output, number
+from fingerspice.results import runfile
 from fingerspice.results.record import SIGNALS, variables
-from fingerspice.results.runfile import CHECKSUM, SIGNATURE, Array, attributes_of, create, signature, tidy, zarr_library
 from fingerspice.solve.streaming import Stream, stream
 
 #: Attributes of the group: identity of the run, number of finished chunks, state to continue from, results so far, and
@@ -44,8 +44,8 @@ class Store:
     """
 
     def __init__(self, path: Path, run: dict[str, Any], total: int, count: int) -> None:
-        self.zarr = zarr_library()
-        self.run = json.loads(json.dumps({**run, "kind of checksum": CHECKSUM}))
+        self.zarr = runfile.zarr_library()
+        self.run = json.loads(json.dumps({**run, "kind of checksum": runfile.CHECKSUM}))
         self.path, self.total, self.count = path, total, count
         self.chunks, self.done, self.there = -(-total // count), 0, False  # Chunks of the whole run
         self.mark: dict[str, Any] = {}
@@ -73,10 +73,10 @@ class Store:
             return
         self._hold(self.path)
         try:
-            held = attributes_of(self.path)
+            held = runfile.attributes_of(self.path)
             kinds = {RUN: dict, MARK: dict, SO_FAR: dict, COLUMNS: dict, DONE: int}
             whole = all(isinstance(held[key], kind) for key, kind in kinds.items()) and held[DONE] >= 0
-            whole = whole and held.get(SIGNATURE, "") in ("", signature(held))
+            whole = whole and held.get(runfile.SIGNATURE, "") in ("", runfile.signature(held))
         except (OSError, ValueError, KeyError, TypeError):
             whole = False
         if not whole:
@@ -93,23 +93,13 @@ class Store:
                 ways = "allowed: --name NAME, another --out, or --overwrite"
                 raise InputError(f"{self.path} holds a run of {what}; {ways}")
         self.done, self.mark, self.so_far = held[DONE], held[MARK], held[SO_FAR]
-        written: set[Path] = set()
-        for name, columns in held[COLUMNS].items():
-            array = self._array(name, columns)
-            for chunk in range(self.done):
-                place = (chunk, 0)[: len(array.shape)]
-                if fault := array.fault(place):
-                    raise InputError(f"{self.path} is damaged: {array.file(place)} {fault}; allowed: --overwrite")
-                written.add(array.file(place))
         # What a call that was killed has left.
-        tidy(self.path)
+        runfile.tidy(self.path)
+        written = set(map(str, range(self.done)))
         for file in self.path.glob("*/c/**/*"):
-            if file not in written and file.is_file():
+            if file.is_file() and file.relative_to(self.path).parts[2] not in written:
                 file.unlink()
-
-    def _array(self, name: str, columns: int, dims: tuple[str, ...] = (), attributes: Any = None) -> Array:
-        more = (columns,) if columns else ()
-        return Array(self.path / name, dims, (self.total, *more), (self.count, *more), attributes or {})
+        runfile.check_store(self.path)
 
     def write(self, chunk: int, solution: fs.Solution, signals: list[str], about: dict[str, Any], mark: Any) -> None:
         """Write a chunk, then record it as finished; `mark` is the state from which the run continues."""
@@ -117,9 +107,12 @@ class Store:
         data = {"time": coords["time"], **data}
         columns = {name: sum(values.shape[1:]) for name, (_, values, _) in data.items()}
         arrays = {
-            name: self._array(name, columns[name], dims, said | {dim: coords[dim][1].tolist() for dim in dims[1:]})
-            for name, (dims, _, said) in data.items()
-        }
+            name: runfile.Array(
+                self.path / name, dims, (self.total, *values.shape[1:]), (self.count, *values.shape[1:]),
+                said | {dim: coords[dim][1].tolist() for dim in dims[1:]},
+            )
+            for name, (dims, values, said) in data.items()
+        }  # fmt: skip
         self.so_far = {
             "method": solution.method, "area": solution.area_mode, "tier": solution.plan.tier,
             "t_stop": solution.t_stop, "error": vars(solution.error), "fold_margin_min": solution.fold_margin_min,
@@ -128,7 +121,7 @@ class Store:
             if not self.there:
                 blank = {RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}
                 # The store is locked before it has its name.
-                if not create(self.path, {**about, **blank}, arrays, {}, self._hold):
+                if not runfile.create(self.path, {**about, **blank}, arrays, {}, self._hold):
                     raise InputError(self._busy)
                 self.there = True
             for name, one in arrays.items():
@@ -137,7 +130,7 @@ class Store:
                 settle_on_disk(one.file(place).parent)
             head = json.loads((self.path / "zarr.json").read_text())
             head["attributes"] |= {DONE: chunk + 1, MARK: mark, SO_FAR: self.so_far}
-            head["attributes"][SIGNATURE] = signature(head["attributes"])
+            head["attributes"][runfile.SIGNATURE] = runfile.signature(head["attributes"])
             write_durably(self.path / "zarr.json", json.dumps(head, indent=1).encode())
         except OSError as error:
             done = f"{self.done} of {self.chunks} pieces are written, and the same command goes on from there"

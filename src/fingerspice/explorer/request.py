@@ -109,28 +109,20 @@ RECORDING = "RECORDING"
 _RECORDED = re.compile(rf"\s*{RECORDING}\s*\(([^()]*)\)\s*", re.IGNORECASE)
 
 
-class Argument(NamedTuple):
-    """One number of a waveform, with its slider's range; an optional one may be left out, and then has its `value`."""
+def _argument(name: str, value: float, unit: str = "", **given: Any) -> dict[str, Any]:
+    """A number of a waveform, with the slider that it has as a parameter of a source unless the menu gives its own.
 
-    name: str
-    unit: str
-    value: float
-    low: float
-    high: float
-    log: bool = False
-    optional: bool = False
-
-
-def _argument(name: str, value: float, unit: str = "", **given: Any) -> Argument:
-    """An argument, with the range that it has as a parameter of a source unless the menu gives its own."""
-    own = dict(zip(("low", "high", "log"), _of_waveform(name, unit, value), strict=True))
-    return Argument(name, unit, value, **{**own, **given})
+    An optional one may be left out, and then has its value.
+    """
+    low, high, log = _of_waveform(name, unit, value)
+    own = {"name": name, "unit": unit, "value": value, "low": low, "high": high, "log": log, "optional": False}
+    return own | given
 
 
 #: The page's menus, of waveforms and of scenes.
 MENUS = tomllib.loads(Path(__file__).with_name("menus.toml").read_text(encoding="utf-8"))
-#: By function: its name on the page, and its numbers in their order.
-WAVEFORMS = {x["kind"]: (x["title"], tuple(_argument(**one) for one in x["arguments"])) for x in MENUS["waveform"]}
+#: The waveforms by function, each with its numbers in their order.
+WAVEFORMS = {x["kind"]: x | {"arguments": [_argument(**one) for one in x["arguments"]]} for x in MENUS["waveform"]}
 #: Waveforms that the page can say as text; their numbers are those of the menu, one of them by another name.
 _TEXTS = {"Sine": "SIN", "Square": "SQUARE", "Triangle": "TRIANGLE", "Sawtooth": "SAWTOOTH", "AM": "AM", "DC": "DC"}
 _FIELDS = {"envelope": "modulation"}
@@ -174,7 +166,7 @@ def text_of(waveform: fs.Waveform) -> str | None:
     kind = _TEXTS.get(type(waveform).__name__)
     if kind is None:
         return None
-    names = [_FIELDS.get(a.name, a.name) for a in WAVEFORMS[kind][1]]
+    names = [_FIELDS.get(a["name"], a["name"]) for a in WAVEFORMS[kind]["arguments"]]
     return f"{kind}({' '.join(value_text(getattr(waveform, name), waveform.units[name]) for name in names)})"
 
 

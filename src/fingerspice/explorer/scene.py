@@ -378,36 +378,19 @@ def means(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any
     }  # fmt: skip
 
 
-class Example(NamedTuple):
-    """One scene of the page's menu: a deck, and what the page asks for with it."""
-
-    name: str  # Short name, which stands in the page's address
-    # title, note: What the menu and the page say about it
-    title: str
-    note: str
-    deck: str
-    asked: Mapping[str, object] = {}  # Further keys of the request, as in `scene`
-
-
-EXAMPLES = tuple(Example(**one) for one in MENUS["scene"])
+EXAMPLES = MENUS["scene"]
 """The scenes of the menu, the first of which is shown at the start."""
 
 
 def beginning(circuit: fs.Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """What the page needs first: its menus, and the scene to begin with."""
-    examples = [
-        {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
-    ]
     own = None
     if circuit is not None:
         changed, unsaid = before(circuit)
         own = {"title": circuit.title, "request": {"deck": circuit.text, **changed, **(asked or {})}, "unsaid": unsaid}
-    waveforms = [
-        {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
-        for kind, (title, arguments) in WAVEFORMS.items()
-    ]
     sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in fs.parameters().values()]
-    return {"version": fs.__version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
+    waveforms = [*WAVEFORMS.values()]
+    return {"version": fs.__version__, "own": own, "examples": EXAMPLES, "waveforms": waveforms, "sets": sets}
 
 
 class Entry(NamedTuple):
@@ -438,11 +421,11 @@ def scenes() -> Iterator[Entry]:
     """The example scenes of the explorer."""
     menus = Path(__file__).with_name("menus.toml")
     for one in EXAMPLES:
-        yield Entry(f"scene-{one.name}", one.title, one.note, menus, partial(_run_scene, one))
+        yield Entry(f"scene-{one['name']}", one["title"], one["note"], menus, partial(_run_scene, one["request"]))
 
 
-def _run_scene(example: Example) -> fs.Solution:
-    asked = Asked({"deck": example.deck, **example.asked})
+def _run_scene(request: dict[str, Any]) -> fs.Solution:
+    asked = Asked(request)
     first, stop, _ = asked.times
     t = np.linspace(first, stop, 4001)
     return fs.simulate(asked.circuit, t_stop=stop, t_eval=t, charge_law=asked.charge_law, throw=False)

@@ -175,8 +175,8 @@ def check_store(path: Path) -> dict[str, int]:
         bad += [f"{path / name} has {len(found[name])} of {least} chunks"] if len(found[name]) < least else []
     if bad:
         more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        raise InputError(f"{path} is damaged: {bad[0]}{more}; allowed: the command that wrote it, which runs a sweep's "
-                         "chunk again, and a run with --overwrite")  # fmt: skip
+        ways = "a run with --overwrite, or a sweep's command, which runs its chunk again"
+        raise InputError(f"{path} is damaged: {bad[0]}{more}; allowed: {ways}")
     return {name: len(files) for name, files in found.items()}
 
 

@@ -123,14 +123,12 @@ class Samples(Ramps):
         InputError
             If the factor is not a whole number from 2 to 64, or the result has too many samples.
         """
-        from scipy.signal import firwin, upfirdn
+        from scipy.signal import firwin, resample_poly
 
         factor = whole_number("factor of upsampling", factor, 2, 64)
         check_count("the upsampled recording", factor * self.count)
-        wing = _WING * factor
-        taps = factor * firwin(2 * wing + 1, 1.0 / factor, window=("kaiser", _BETA))
-        dense = upfirdn(taps, np.pad(self.values, _WING, mode="edge"), up=factor)
-        dense = dense[2 * wing :][: (self.count - 1) * factor + 1]
+        taps = firwin(2 * _WING * factor + 1, 1.0 / factor, window=("kaiser", _BETA))
+        dense = resample_poly(self.values, factor, 1, window=taps, padtype="edge")[: (self.count - 1) * factor + 1]
         # The finite window makes the filter slightly inexact at the given samples: restore them.
         dense[::factor] = self.values
         return Samples(dense, factor * self.rate, self.start)
