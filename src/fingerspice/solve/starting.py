@@ -69,7 +69,7 @@ def to_loop(scene: Scene, state: State) -> tuple[FloatArray, float]:
 
 def from_loop(scene: Scene, t: float, y: FloatArray, before: float, u_gap: float) -> State:
     """The state used for all circuits, from that of `to_loop` at time t (s), with `before` (V) around the loop."""
-    model, stack, sign, scale, y = model_of(scene), scene.stack, 0.0, 1.0, y.copy()
+    model, stack, sign, scale, y = model_of(scene), scene.network.stack, 0.0, 1.0, y.copy()
     if model.mobile:
         inverse = inverse_area(abs(u_gap), model.curve)[0]
         scale = model.area0 * inverse
@@ -82,10 +82,10 @@ def from_loop(scene: Scene, t: float, y: FloatArray, before: float, u_gap: float
 
 def as_shown(scene: Scene, row: FloatArray) -> FloatArray:
     """A row as in `Record` with a voltage for each layer in place of each cell, as in `Scene.shown`."""
-    if scene.stack is None or scene.shown is scene:
+    if scene.network.stack is None or scene.shown is scene:
         return row
     n = scene.turn.size
-    return np.append(scene.shown.turn * (scene.stack.grouping @ (scene.turn * row[:n])), row[n:])
+    return np.append(scene.shown.turn * (scene.network.stack.grouping @ (scene.turn * row[:n])), row[n:])
 
 
 def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> State:
@@ -125,8 +125,8 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
 
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Cell voltages (V), areas (m^2) and sources at the DC operating point (at 0-), the nodes in `initial` held."""
-    net, stack = scene.net, scene.stack
-    s = np.array([float(w.value(0.0, "left")) for w in scene.waveforms])
+    net, stack = scene.net, scene.network.stack
+    s = np.array([float(w.value(0.0, "left")) for w in scene.network.waveforms])
     if stack is not None and scene.model is not None and not initial:
         order = list(stack.state_order)
         return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.area0, s
@@ -185,7 +185,7 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
     if s is None and q.size and np.any(rest):
         # The values that agree with the cell voltages in the least-squares sense.
         before = np.asarray(np.linalg.lstsq(q, rest, rcond=None)[0], float)
-    after = np.array([float(w.value(0.0)) for w in scene.waveforms])
+    after = np.array([float(w.value(0.0)) for w in scene.network.waveforms])
     # The run itself reports a source that is not finite.
     after[~np.isfinite(after)] = 0.0
     if float(np.abs(rest - q @ before).max(initial=0.0)) > ROUNDING * float(np.abs(u).max(initial=0.0)):
