@@ -50,7 +50,7 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     """
     scene, start = problem.scene, problem.initial
     at_once, charge_error = scene.network.stack is not None and area is None, None
-    area = scene.area0 if area is None else area
+    area = scene.net.area0 if area is None else area
     tables = Tables(problem, 1e-12 if at_once else 1e-13, no_chirps=not at_once)
     modes = kept_with(scene.prepared, ("modes", *area.tolist()), MOST_MODES, lambda: scene.modes_at(area))
     n = modes.rates.size

@@ -189,7 +189,7 @@ class Known:
     """
 
     def __init__(self, scene: Scene, decade: int) -> None:
-        n_area, (numbers, magnified, self.shapes) = scene.area0.size, self._referred(scene, scene.area0)
+        n_area, (numbers, magnified, self.shapes) = scene.net.area0.size, self._referred(scene, scene.net.area0)
         counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
         self.arrays = References(np.zeros((2, n_area), np.int64), np.zeros((2, numbers.size)), *counts)
         self.tables = new_tables(self.shapes[0][0])
@@ -205,7 +205,7 @@ class Known:
         self.fixed: dict[str, Any] = {
             "mobile": net.mobile, "c": net.c[fed], "g": net.g_area[fed], "home": net.place[fed],
             "first": np.searchsorted(net.place[fed], np.arange(n_area + 1)), "cell": np.array(cell, np.int64),
-            "unit": scene.area0.copy(), "slow": np.where(slow, n + net.slow, -1),
+            "unit": scene.net.area0.copy(), "slow": np.where(slow, n + net.slow, -1),
             "pace": np.where(slow, 1.0 / np.where(slow, net.tau, 1.0), 0.0), "stress": stress,
             "powers": powers, "slopes": slopes, "lo": lo, "scale": scale, "curves": net.curves,
             "through": np.ascontiguousarray(network.through[:, fed]),
@@ -222,7 +222,7 @@ class Known:
         if one == len(arrays.levels):
             more = {"levels": np.zeros_like(arrays.levels), "numbers": np.zeros_like(arrays.numbers)}
             self.arrays = arrays = arrays._replace(**{k: np.append(getattr(arrays, k), x, 0) for k, x in more.items()})
-        area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
+        area = scene.net.area0 * LEVEL_RATIO ** np.array(levels, float)
         arrays.numbers[one], magnified, _ = self._referred(scene, area)
         arrays.levels[one] = levels
         arrays.used[0] += 1
@@ -275,7 +275,7 @@ def by_modes(network: Network, modes: Modes, area: FloatArray) -> dict[str, Floa
 def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
     """The arrays in `REFERRED` for reference areas (m^2) in one row, the round-off as in `Known`, and their shapes."""
     network, net = scene.network, scene.net
-    modes = scene.modes_at(area) if area is not scene.area0 else scene.modes
+    modes = scene.modes_at(area) if area is not scene.net.area0 else scene.modes
     n, n_s = modes.gains.shape
     slow, fed, fingers = net.slow >= 0, _fed(scene), list(network.fingers)
     n_slow, cells = int(np.count_nonzero(slow)), np.array([network.gaps[i] for i in fingers], int)
@@ -313,7 +313,7 @@ class March(Stepping):
         self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
         self.gaps, self.largest = list(scene.network.fingers), u_scale
         self.area_error = max((area_missed(curve, self.decade) for curve in scene.net.curves), default=0.0)
-        self.capacitance = float(problem.network.capacitance(scene.area0).sum())
+        self.capacitance = float(problem.network.capacitance(scene.net.area0).sum())
         super().__init__(problem, tol * u_scale, size - n_s, size + n_s if problem.charge else size)
         self.control["magnified"] = 1.0
         self.error = np.zeros(self.n + self.n_slow)

@@ -63,7 +63,7 @@ class Collocation(Integration):
         super().__init__(problem)
         self.scheme, self.tol, self.progress = scheme, tol, progress
         self.rows = np.full((self.t_out.size, self.width), np.nan)
-        least = problem.scene.area0.copy()
+        least = problem.scene.net.area0.copy()
         for i, contact in enumerate(problem.network.contacts):
             if contact is not None and self.net.gap[i] >= 0:
                 # Where voltage presses an area away, its charge moves at voltages that are a small part of the peak.

@@ -119,7 +119,7 @@ class Period:
         scene, network, net = self.problem.scene, self.problem.network, self.problem.scene.net
         u = net.p @ self.voltages(z) + net.q @ self.before
         along, weight = (np.ones(1), np.ones(1)) if net.mobile else _GAUSS
-        area, charge = scene.area0.copy(), np.zeros(u.size)
+        area, charge = scene.net.area0.copy(), np.zeros(u.size)
         for share, part in zip(along, weight, strict=True):
             for i in np.flatnonzero(net.gap >= 0).tolist():
                 slow, following = net.slow[i], float(self.contacts[i].area(share * abs(u[net.gap[i]])))
@@ -240,7 +240,7 @@ class Search(Period):
             x = along @ modes.shape.T - s @ modes.follow.T
             for k, i in enumerate(slow.tolist()):
                 u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
-                relative[k] = float(np.mean(self.contacts[i].area(np.abs(u)))) / problem.scene.area0[i]
+                relative[k] = float(np.mean(self.contacts[i].area(np.abs(u)))) / problem.scene.net.area0[i]
         return np.append(np.where(self.neutral[: self.n], self.kept, start), relative)
 
     def _inverse(self, slope: FloatArray) -> FloatArray:
@@ -441,8 +441,8 @@ class Search(Period):
         share = np.append((SAFETY * grown + np.abs(step))[self.n :], 0.0)[slow]
         u_error, f_error = u_error + peak * share, f_error + 3.0 * force * share
         live = peak > 4e-15 * self.scale
-        over = np.append((u_error / np.where(live, peak, 1.0))[live], (f_error / np.where(live, force, 1.0))[live])
-        rounding = float((2.0 * floor / np.where(live, peak, 1.0))[live].max(initial=0.0))
+        over = np.append(u_error[live] / peak[live], f_error[live] / force[live])
+        rounding = float((2.0 * floor[live] / peak[live]).max(initial=0.0))
         return np.column_stack([u_error, f_error]), float(over.max(initial=0.0)) / self.rtol, rounding / self.rtol
 
 

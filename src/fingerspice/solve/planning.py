@@ -67,7 +67,7 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
 def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     scene, model, span = problem.scene, problem.scene.model, problem.t_stop - problem.t_start
     if model is None:
-        changed, area = math.nan, float(scene.area0[0]) if problem.network.areas else math.nan
+        changed, area = math.nan, float(scene.net.area0[0]) if problem.network.areas else math.nan
         if not scene.coupled:
             changed = 0.0
         elif len(problem.network.sources) == problem.network.n_voltage:

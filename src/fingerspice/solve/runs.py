@@ -244,7 +244,7 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         if run.t_failed is not None and breakpoints_at(problem.network.waveform, run.t_failed).size:
             cause += " (the source jumps past the fold at this time)"
         areas = record.each("area")
-        shrunk = [x[-1] / problem.scene.area0[j] for x, j in zip(areas, problem.network.fingers, strict=True)]
+        shrunk = [x[-1] / problem.scene.net.area0[j] for x, j in zip(areas, problem.network.fingers, strict=True)]
         i = int(np.argmin(shrunk))
         signals = record.each("u_gap")[i], areas[i], record.fold_margin
         element, (u_gap, area, margin) = names[i], (float(x[-1]) for x in signals)

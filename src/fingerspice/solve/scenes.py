@@ -110,14 +110,9 @@ class Scene:
         return kept_with(self.prepared, ("shown",), 1, made)
 
     @cached_property
-    def area0(self) -> FloatArray:
-        """The areas, m^2: fixed ones, and those at 0 V of areas that follow their gap."""
-        return np.asarray(self.net.area0)
-
-    @cached_property
     def modes(self) -> Modes:
-        """Modes of the circuit with the areas `area0`."""
-        return self.modes_at(self.area0)
+        """Modes of the circuit with its fixed areas, and those at 0 V of areas that follow their gap."""
+        return self.modes_at(self.net.area0)
 
     @cached_property
     def rates(self) -> FloatArray:
@@ -152,7 +147,7 @@ class Scene:
         gaps = tuple(gap for gap in self.network.gaps if gap is not None)
         if gaps or not self.network.cells:
             return gaps
-        return (int(np.argmin(self.network.capacitance(self.area0))),)
+        return (int(np.argmin(self.network.capacitance(self.net.area0))),)
 
 
 def scene_of(

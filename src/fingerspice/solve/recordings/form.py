@@ -495,13 +495,13 @@ def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> Network
     if not is_followed(scene, problem.circuit):
         return None
     # The gap's largest share of a sine of the source, over the frequencies that a recording may have.
-    one, lowest = Reduced(scene, source, scene.area0, False), min(1.0 / problem.t_stop, 0.4 * wave.rate)
+    one, lowest = Reduced(scene, source, scene.net.area0, False), min(1.0 / problem.t_stop, 0.4 * wave.rate)
     omega = 2.0 * np.pi * np.geomspace(lowest, 0.5 * wave.rate, _FREQUENCIES)
     response = one.k + (one.shape * one.gain / (1j * omega[:, None] + one.rates)).sum(axis=1)
     share, moving = float(np.abs(response).max()), one.moving
     # The peak of a current is not known to the scene; that of a voltage has been looked up in the file already.
     typical = _TYPICAL * min(scene.u_top, share * (scene.u_peak or wave.peak(0.0, problem.t_stop)))
-    area0 = scene.area0.copy()
+    area0 = scene.net.area0.copy()
     area0[moving] = 1.0 / inverse_area(typical, scene.net.curves[moving])[0]
     one = Reduced(scene, source, area0, problem.charge)
     polynomials = curves(scene.net.curves[moving], one.q0, one.kappa, scene.u_top, rtol)
