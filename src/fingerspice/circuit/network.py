@@ -30,7 +30,7 @@ from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of,
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
-from fingerspice.waveforms.waveform import Waveform, refuse, require
+from fingerspice.waveforms.waveform import Sum, Waveform, refuse, require
 
 # A current of a source that is this small, relative to what it is the difference of, is rounding.
 _ROUNDING = 1e-13
@@ -98,6 +98,11 @@ class Network:
     def waveforms(self) -> tuple[Waveform, ...]:
         """Waveform of each source, V or A."""
         return tuple(e.waveform for e in self.sources if e.waveform is not None)
+
+    @cached_property
+    def waveform(self) -> Waveform:
+        """All sources at once, for their common period, breakpoints and shortest time."""
+        return self.waveforms[0] if len(self.waveforms) == 1 else Sum(self.waveforms)
 
     @cached_property
     def grouping(self) -> FloatArray:

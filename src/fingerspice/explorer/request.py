@@ -354,8 +354,7 @@ class Asked:
     @cached_property
     def waveform(self) -> fs.Waveform:
         """All sources as one waveform."""
-        waveforms = network_of(self.circuit).waveforms
-        return waveforms[0] if len(waveforms) == 1 else fs.Sum(waveforms)
+        return network_of(self.circuit).waveform
 
     @cached_property
     def times(self) -> tuple[float, float, float | None]:

@@ -49,8 +49,8 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     error from holding the areas, relative to the peaks; 0 where they are exact or have no effect.
     """
     scene, start = problem.scene, problem.initial
-    at_once, charge_error = scene.stack is not None and area is None, None
-    area = scene.area0 if area is None else area
+    at_once, charge_error = scene.network.stack is not None and area is None, None
+    area = scene.net.area0 if area is None else area
     tables = Tables(problem, 1e-12 if at_once else 1e-13, no_chirps=not at_once)
     modes = kept_with(scene.prepared, ("modes", *area.tolist()), MOST_MODES, lambda: scene.modes_at(area))
     n = modes.rates.size
@@ -96,7 +96,7 @@ def _along(matrix: FloatArray, values: FloatArray) -> FloatArray:
 def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray) -> tuple[_Answer, _Answer, float]:
     """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s."""
     t_out, left = problem.t_out, problem.left
-    n, n_s, size = v0.size, len(problem.waveforms), t_out.size
+    n, n_s, size = v0.size, len(problem.network.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
     v, s, integral, slope = (np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s))
     v[:], s[size], end, first = v0, problem.initial.s_before, problem.t_start, 0
@@ -131,7 +131,7 @@ def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArra
 
 def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, _Answer] | None:
     """Live voltages (n_t, n), V, and the response at the end, by a recursion; None for outputs at other times."""
-    wave, t_out = problem.waveform, problem.t_out
+    wave, t_out = problem.network.waveform, problem.t_out
     if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
         return None
     if wave.start != problem.t_start or t_out[-1] < problem.t_stop * (1.0 - 1e-12):
@@ -178,7 +178,7 @@ def _finished(
     largest = max(problem.largest, problem.scene.u_size)
     if problem.network.n_voltage < len(problem.network.sources):
         largest = max(largest, float(np.abs(rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
-    rounding = (ROUNDING_OF_MATRICES if problem.scene.stack is None else ROUNDING) * largest
+    rounding = (ROUNDING_OF_MATRICES if problem.network.stack is None else ROUNDING) * largest
     gaps, record = [], run.record(problem)
     for i, u in enumerate(record.each("u_gap")):
         place, peak = record.network.fingers[i], max(float(u.max(initial=0.0)), -float(u.min(initial=0.0)))
@@ -236,7 +236,7 @@ def run_to_fold(problem: Problem) -> Run | None:
     """A run under the `mobile` law up to the fold that it reaches or jumps past; None where it reaches no fold."""
     run = solve_by_steps(problem, FINEST_RTOL, repeat=False)
     run.gaps[:, 2:] *= SAFETY
-    jumped = run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size > 0
+    jumped = run.t_failed is not None and breakpoints_at(problem.network.waveform, run.t_failed).size > 0
     # Where the gap voltage is as small as rounding, steps may cross a fold unseen: their end is not the fold.
     unseen = not jumped and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD
     if run.status is Status.FOLD and not unseen:

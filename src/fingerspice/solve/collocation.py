@@ -89,14 +89,14 @@ def system_of(
     The area curve reaches `u_top` (V) and the reference areas `u_peak` (V) if these are above 0.
     """
     model, (contact,) = model_of(scene), scene.network.contacts
-    assert scene.stack is not None
+    assert scene.network.stack is not None
     if u_top > 0.0 and contact is not None:
         model = model._replace(curve=contact.curve(u_top))
     stress = 0.0 if contact is None else float(contact.stress(1.0))
     u_max, n = u_peak or max(scene.u_peak, u_top), model.gap.size
     nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
     u_range = inverse_area_range(u_max, 17, model.curve)
-    return systems.build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
+    return systems.build_system(model, area_error(decade), u_range, scene.network.stack.grouping, nodes, stress, ratio)
 
 
 class Track(Stepping):
@@ -164,7 +164,7 @@ class Track(Stepping):
         rows[:, :n] *= shown.turn
         if self.pace.charge and model.mobile:
             (cell,), network = shown.measured, shown.network
-            u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out])
+            u = sided(self.problem.network.waveform, self.t_out[:n_out], self.left[:n_out])
             u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
             rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s
 
@@ -189,7 +189,7 @@ class Known:
     """
 
     def __init__(self, scene: Scene, decade: int) -> None:
-        n_area, (numbers, magnified, self.shapes) = scene.area0.size, self._referred(scene, scene.area0)
+        n_area, (numbers, magnified, self.shapes) = scene.net.area0.size, self._referred(scene, scene.net.area0)
         counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
         self.arrays = References(np.zeros((2, n_area), np.int64), np.zeros((2, numbers.size)), *counts)
         self.tables = new_tables(self.shapes[0][0])
@@ -205,7 +205,7 @@ class Known:
         self.fixed: dict[str, Any] = {
             "mobile": net.mobile, "c": net.c[fed], "g": net.g_area[fed], "home": net.place[fed],
             "first": np.searchsorted(net.place[fed], np.arange(n_area + 1)), "cell": np.array(cell, np.int64),
-            "unit": scene.area0.copy(), "slow": np.where(slow, n + net.slow, -1),
+            "unit": scene.net.area0.copy(), "slow": np.where(slow, n + net.slow, -1),
             "pace": np.where(slow, 1.0 / np.where(slow, net.tau, 1.0), 0.0), "stress": stress,
             "powers": powers, "slopes": slopes, "lo": lo, "scale": scale, "curves": net.curves,
             "through": np.ascontiguousarray(network.through[:, fed]),
@@ -222,7 +222,7 @@ class Known:
         if one == len(arrays.levels):
             more = {"levels": np.zeros_like(arrays.levels), "numbers": np.zeros_like(arrays.numbers)}
             self.arrays = arrays = arrays._replace(**{k: np.append(getattr(arrays, k), x, 0) for k, x in more.items()})
-        area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
+        area = scene.net.area0 * LEVEL_RATIO ** np.array(levels, float)
         arrays.numbers[one], magnified, _ = self._referred(scene, area)
         arrays.levels[one] = levels
         arrays.used[0] += 1
@@ -275,7 +275,7 @@ def by_modes(network: Network, modes: Modes, area: FloatArray) -> dict[str, Floa
 def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
     """The arrays in `REFERRED` for reference areas (m^2) in one row, the round-off as in `Known`, and their shapes."""
     network, net = scene.network, scene.net
-    modes = scene.modes_at(area) if area is not scene.area0 else scene.modes
+    modes = scene.modes_at(area) if area is not scene.net.area0 else scene.modes
     n, n_s = modes.gains.shape
     slow, fed, fingers = net.slow >= 0, _fed(scene), list(network.fingers)
     n_slow, cells = int(np.count_nonzero(slow)), np.array([network.gaps[i] for i in fingers], int)
@@ -309,16 +309,16 @@ class March(Stepping):
 
     def __init__(self, problem: Problem, rtol: float, tol: float, u_scale: float, repeat: bool) -> None:
         scene, size = problem.scene, problem.initial.y.size
-        n_s, n_area = len(scene.waveforms), scene.net.gap.size
+        n_s, n_area = len(scene.network.waveforms), scene.net.gap.size
         self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
         self.gaps, self.largest = list(scene.network.fingers), u_scale
         self.area_error = max((area_missed(curve, self.decade) for curve in scene.net.curves), default=0.0)
-        self.capacitance = float(problem.network.capacitance(scene.area0).sum())
+        self.capacitance = float(problem.network.capacitance(scene.net.area0).sum())
         super().__init__(problem, tol * u_scale, size - n_s, size + n_s if problem.charge else size)
         self.control["magnified"] = 1.0
         self.error = np.zeros(self.n + self.n_slow)
         self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
-        self.shortest = problem.waveform.shortest_time()
+        self.shortest = problem.network.waveform.shortest_time()
         self.references = known_references(scene, self.decade)
         self.form = self.references.form()
         self.held, cells = held(self.form), self.form.c.size
@@ -373,7 +373,7 @@ class March(Stepping):
 
 def stepping(problem: Problem, rtol: float, tol: float, u_scale: float, top: float, repeat: bool) -> Track | March:
     """An integration with an error of `tol` times `u_scale` (V) in every step; for `top` see `Track`."""
-    if problem.scene.stack is None:
+    if problem.network.stack is None:
         return March(problem, rtol, tol, u_scale, repeat)
     return Track(problem, rtol, tol * u_scale, top, repeat)
 
@@ -385,7 +385,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     With `repeat`, later periods may repeat one period, once the state no longer changes from one to the next.
     """
     tables = Tables(problem, LOCAL_SHARE * rtol)
-    is_stack = problem.scene.stack is not None
+    is_stack = problem.network.stack is not None
     met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
     if is_stack:
         # The largest gap voltage to expect.

@@ -92,7 +92,8 @@ class _Parameter:
 
     def longer(self) -> float:
         """Relative change of the sources' common period, per unit of the parameter; NaN where there is none near it."""
-        own, *periods = (period_of(circuit) or math.nan for circuit in (self.circuit, *self.circuits()))
+        networks = map(network_of, (self.circuit, *self.circuits()))
+        own, *periods = (network.waveform.period or math.nan for network in networks)
         if not max(abs(period / own - 1.0) for period in periods) <= 0.01:
             return math.nan
         return float(self.by(periods)) / own if set(periods) != {own} else 0.0
@@ -115,12 +116,6 @@ def _gaps(run: Solution) -> FloatArray:
     """Gap voltages, V, shape (n_t, n_gap)."""
     assert run.u_gap is not None
     return run.u_gap.reshape(run.t.size, -1)
-
-
-def period_of(circuit: Circuit) -> float | None:
-    """Common period of a circuit's sources, s."""
-    waves = network_of(circuit).waveforms
-    return (waves[0] if len(waves) == 1 else Sum(waves)).period
 
 
 def check_request(problem: Problem, paths: Sequence[str], method: str) -> str:
@@ -201,7 +196,7 @@ class _Intervals:
         waves = [(e.name, sign, as_samples(e.waveform)) for e, sign in drives if e.waveform is not None]
         known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
         if len(known) != 1 or not isinstance(driving(problem)[1], Samples):
-            others = "sources of 0" if problem.scene.stack is None else "constant ones"
+            others = "sources of 0" if problem.network.stack is None else "constant ones"
             said = f"of the circuit's {len(waves)} sources {len(known)} are recordings; allowed: one, such as"
             raise InputError(f"{_ASKED}{said} fs.Samples, or a PWL on an even grid, beside {others}")
         ((self.name, self.sign, wave),) = known
@@ -223,7 +218,7 @@ class _Intervals:
         # (n + 1,): Start and end of the run, and samples and outputs between, s
         self.t = t[np.append(True, np.diff(t) > self.slack)]
         # (n + 1,): The source at these times
-        self.x, h = np.ascontiguousarray(self.problem.waveform.value(self.t)), np.diff(self.t)
+        self.x, h = np.ascontiguousarray(self.problem.network.waveform.value(self.t)), np.diff(self.t)
         # Lengths of the intervals (n,), or their common one (1,), s
         self.h = h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
 
@@ -266,7 +261,7 @@ class _Intervals:
 
     def outputs(self, by: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
         """Derivatives of a number, by its outputs, by the modes (m, n + 1) and the source (n + 1,) at all times."""
-        m, run, stack = self.m, self.run, self.problem.scene.stack
+        m, run, stack = self.m, self.run, self.problem.network.stack
         ((_, contact),) = run.record.fingers
         assert run.u_gap is not None
         # By the gap voltage along the loop.

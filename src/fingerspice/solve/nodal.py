@@ -63,7 +63,7 @@ class Collocation(Integration):
         super().__init__(problem)
         self.scheme, self.tol, self.progress = scheme, tol, progress
         self.rows = np.full((self.t_out.size, self.width), np.nan)
-        least = problem.scene.area0.copy()
+        least = problem.scene.net.area0.copy()
         for i, contact in enumerate(problem.network.contacts):
             if contact is not None and self.net.gap[i] >= 0:
                 # Where voltage presses an area away, its charge moves at voltages that are a small part of the peak.
@@ -140,7 +140,7 @@ def pass_through(
 
 def _schemes(problem: Problem) -> tuple[Scheme, Scheme]:
     """The coarser run's method and the run's."""
-    longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
+    longest = min(LONGEST_STEP * problem.network.waveform.shortest_time(), problem.max_step)
     return radau_scheme(STAGES_BESIDE)._replace(h_max=longest), radau_scheme(STAGES)._replace(h_max=longest)
 
 
@@ -195,7 +195,7 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
             tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), finest)
         if last:
             break
-    span = max(folded, min(problem.waveform.shortest_time(), problem.t_stop - problem.t_start))
+    span = max(folded, min(problem.network.waveform.shortest_time(), problem.t_stop - problem.t_start))
     believed = nearest is not None and nearest[0] <= FOLD_SPREAD * span
     if nearest is not None and (run.status is Status.FOLD or (believed and run.status is not Status.SUCCESS)):
         # Round-off may dominate at the finest tolerances: take the run whose fold differs least from its predecessor's.
@@ -252,7 +252,7 @@ def _with_probes(problem: Problem) -> tuple[Problem, BoolArray]:
     They do not depend on the output times, so that neither the error nor the tolerance depends on them.
     """
     span = problem.t_stop - problem.t_start
-    count = int(min(max(PROBES, PROBES_PER_PERIOD * span / problem.waveform.shortest_time()), MOST_PROBES))
+    count = int(min(max(PROBES, PROBES_PER_PERIOD * span / problem.network.waveform.shortest_time()), MOST_PROBES))
     probes = np.linspace(problem.t_start, problem.t_stop, count + 2)[1:-1]
     # Transients right after an edge may decay between two equidistant times, so look at them on a logarithmic grid.
     edges = np.unique(np.append(problem.breakpoints(), [problem.t_start, problem.t_stop]))

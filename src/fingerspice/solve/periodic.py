@@ -61,7 +61,7 @@ class Period:
     """One period of a problem, or only its first half if the second half is the first with opposite sign."""
 
     def __init__(self, problem: Problem) -> None:
-        waveform, scene, net = problem.waveform, problem.scene, problem.scene.net
+        waveform, scene, net = problem.network.waveform, problem.scene, problem.scene.net
         assert waveform.period is not None
         # The first whole period after the sources have become periodic, and not before the run's start, s.
         self.begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
@@ -70,7 +70,7 @@ class Period:
         self.modes: Modes = scene.modes
         n = self.n = self.modes.rates.size
         # (n_s,): Sources just before the period, V or A.
-        self.before = np.array([float(w.value(self.begin, "left")) for w in scene.waveforms])
+        self.before = np.array([float(w.value(self.begin, "left")) for w in scene.network.waveforms])
         # (n + n_slow,): Decay rates of the modes and of the areas with a time constant, 1/s, and which of them are 0:
         # charges that nothing drains.
         self.rates = np.append(self.modes.rates, 1.0 / net.tau[net.slow >= 0])
@@ -85,7 +85,7 @@ class Period:
         # A function's table depends on the output step as well.
         key, end = ("period", self.begin, self.span, problem.step if scene.is_sampled else 0.0), self.begin + self.span
         self.tables = kept_with(scene.prepared, key, MOST_PERIODS, lambda: [
-            source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.waveforms
+            source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.network.waveforms
         ])  # fmt: skip
         broken = [table.not_finite for table in self.tables if table.not_finite is not None]
         if broken:
@@ -94,7 +94,7 @@ class Period:
         self.end = float(min(table.edges[-1] for table in self.tables))
         if pushed and self.begin > problem.t_start:
             # Add the charge that sources drive into the neutral modes between the run's start and the period.
-            for j, wave in enumerate(scene.waveforms):
+            for j, wave in enumerate(scene.network.waveforms):
                 table = source_table(wave, problem.t_start, self.begin, 1e-13, problem.step)
                 gains, still = np.where(self.neutral[:n], self.modes.gains[:, j], 0.0), np.zeros(n)
                 _, moved = linear.respond(still, gains, table.edges, table.terms, table.series, still, [])
@@ -119,7 +119,7 @@ class Period:
         scene, network, net = self.problem.scene, self.problem.network, self.problem.scene.net
         u = net.p @ self.voltages(z) + net.q @ self.before
         along, weight = (np.ones(1), np.ones(1)) if net.mobile else _GAUSS
-        area, charge = scene.area0.copy(), np.zeros(u.size)
+        area, charge = scene.net.area0.copy(), np.zeros(u.size)
         for share, part in zip(along, weight, strict=True):
             for i in np.flatnonzero(net.gap >= 0).tolist():
                 slow, following = net.slow[i], float(self.contacts[i].area(share * abs(u[net.gap[i]])))
@@ -163,8 +163,8 @@ def _turns(problem: Problem) -> bool:
 
     The circuit itself has this symmetry: it is linear except for the areas, which depend on the modulus of a voltage.
     """
-    period = problem.waveform.period
-    for wave in problem.scene.waveforms:
+    period = problem.network.waveform.period
+    for wave in problem.network.waveforms:
         if wave == DC(0.0):
             continue
         if not wave.half_wave or wave.period is None or period is None:
@@ -236,11 +236,11 @@ class Search(Period):
         start, _, along = self.linear_state(times)
         relative = np.ones(slow.size)
         if slow.size:
-            s = np.column_stack([wave.value(times) for wave in problem.waveforms])
+            s = np.column_stack([wave.value(times) for wave in problem.network.waveforms])
             x = along @ modes.shape.T - s @ modes.follow.T
             for k, i in enumerate(slow.tolist()):
                 u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
-                relative[k] = float(np.mean(self.contacts[i].area(np.abs(u)))) / problem.scene.area0[i]
+                relative[k] = float(np.mean(self.contacts[i].area(np.abs(u)))) / problem.scene.net.area0[i]
         return np.append(np.where(self.neutral[: self.n], self.kept, start), relative)
 
     def _inverse(self, slope: FloatArray) -> FloatArray:
@@ -441,8 +441,8 @@ class Search(Period):
         share = np.append((SAFETY * grown + np.abs(step))[self.n :], 0.0)[slow]
         u_error, f_error = u_error + peak * share, f_error + 3.0 * force * share
         live = peak > 4e-15 * self.scale
-        over = np.append((u_error / np.where(live, peak, 1.0))[live], (f_error / np.where(live, force, 1.0))[live])
-        rounding = float((2.0 * floor / np.where(live, peak, 1.0))[live].max(initial=0.0))
+        over = np.append(u_error[live] / peak[live], f_error[live] / force[live])
+        rounding = float((2.0 * floor[live] / peak[live]).max(initial=0.0))
         return np.column_stack([u_error, f_error]), float(over.max(initial=0.0)) / self.rtol, rounding / self.rtol
 
 
@@ -453,7 +453,7 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
     stated error is larger. Sources without a common period are refused; a period that cannot be integrated, or that
     leads to no periodic state, is a `SolveError`.
     """
-    if problem.waveform.period is None:
+    if problem.network.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
     period = Search(problem, rtol) if problem.scene.coupled else Period(problem)
     found, moved = period.close(), period.begin - problem.t_start

@@ -67,7 +67,7 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
 def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     scene, model, span = problem.scene, problem.scene.model, problem.t_stop - problem.t_start
     if model is None:
-        changed, area = math.nan, float(scene.area0[0]) if problem.network.areas else math.nan
+        changed, area = math.nan, float(scene.net.area0[0]) if problem.network.areas else math.nan
         if not scene.coupled:
             changed = 0.0
         elif len(problem.network.sources) == problem.network.n_voltage:
@@ -80,20 +80,20 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     if chosen != best:
         _refuse(problem, chosen, best)
         reason = f"asked for; the lightest that is right would be {best}: {reason}"
-    rates, shortest = scene.rates, min(problem.waveform.shortest_time(), span)
+    rates, shortest = scene.rates, min(problem.network.waveform.shortest_time(), span)
     fastest = float(rates.max(initial=0.0))
     reasons, stiff, needed = [reason], fastest * shortest > STIFF, 0.0
     if stiff:
         reasons.append(f"stiff: the fastest rate {fastest:.3g} 1/s against {1.0 / shortest:.3g} 1/s of the source")
-    if chosen == "coupled" and scene.coupled and problem.waveform.period:
-        reasons += [REPEATS] if span / problem.waveform.period >= FEWEST_PERIODS else []
+    if chosen == "coupled" and scene.coupled and problem.network.waveform.period:
+        reasons += [REPEATS] if span / problem.network.waveform.period >= FEWEST_PERIODS else []
     if chosen == "linear" and model is not None and scene.coupled and np.any(model.rate0 > 0.0):
         needed = changed
     if scene.skin is not None:
         f, error = scene.skin
         reasons.append(f"skin at {f:g} Hz: its dispersion moves the gap voltage by {error:.1g}")
         needed += error
-    elif scene.stack is not None and problem.circuit.by_device("SKIN_DISPERSIVE"):
+    elif scene.network.stack is not None and problem.circuit.by_device("SKIN_DISPERSIVE"):
         reasons.append(f"skin dispersive: no one frequency serves to rtol = {rtol:g}")
     if scene.is_sampled:
         event = format_si(shortest_event(problem), "s")
@@ -104,7 +104,7 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
 
 def _refuse(problem: Problem, tier: str, best: str) -> None:
     """Refuse a tier that cannot describe the circuit."""
-    stack, mobile = problem.scene.stack, problem.scene.charge_law == "mobile"
+    stack, mobile = problem.network.stack, problem.scene.charge_law == "mobile"
     if stack is None and tier != "coupled":
         others = "auto" if best == "coupled" else f"auto, {best}"
         raise InputError(f"the {tier} tier is not for this network; allowed: {others} or coupled")
@@ -119,7 +119,7 @@ def _refuse(problem: Problem, tier: str, best: str) -> None:
 
 def _stores(problem: Problem) -> bool:
     """Whether a stack starts with charge on the interfaces between its layers."""
-    return problem.scene.stack is not None and bool(problem.inner[0][:-1].any())
+    return problem.network.stack is not None and bool(problem.inner[0][:-1].any())
 
 
 def _of_network(problem: Problem, changed: float) -> tuple[str, str]:
@@ -175,7 +175,7 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
     key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
     yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
-    if success and problem.waveforms and not run.gaps[:, 0].any():
+    if success and problem.network.waveforms and not run.gaps[:, 0].any():
         yield from _off_warning(problem)
     if run.note and success:
         yield run.note
@@ -228,17 +228,17 @@ def _source_warnings(problem: Problem) -> Iterator[str]:
     """Warnings about sources that miss the run, and about sources beyond the band of the skin's data."""
     yield from course_warnings(problem.circuit, problem.t_start, problem.t_stop, problem.by_deck)
     event = shortest_event(problem)
-    plain = any(isinstance(wave, Function) and not wave.breaks for wave in problem.waveforms)
+    plain = any(isinstance(wave, Function) and not wave.breaks for wave in problem.network.waveforms)
     if plain and event > _EVENT:
         seen = f"which was looked at every {format_si(event, 's')}: an event shorter than that may have been missed"
         mend = "give Function(f, breaks=(...)) its edges, or the circuit a .tran of a shorter TSTEP"
         yield f"the source is a function, {seen}; {mend}"
-    yield from spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
+    yield from spectrum_warning(problem.circuit, problem.network.waveform, problem.t_stop)
 
 
 def _off_warning(problem: Problem) -> Iterator[str]:
     """A warning about sources that are 0 in the whole run, unless a charge of the start drives it."""
-    currents = problem.waveforms[problem.network.n_voltage :]
+    currents = problem.network.waveforms[problem.network.n_voltage :]
     if any((problem.scene.u_peak, *(wave.peak(problem.t_start, problem.t_stop) for wave in currents))):
         return
     small = ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None)
@@ -246,6 +246,6 @@ def _off_warning(problem: Problem) -> Iterator[str]:
         alone = f"{small} has AC alone, which drives sweeps (fingerspice ac)"
         yield f"the sources are 0 all the time: {alone}; a sine in time is SIN(VO VA FREQ)"
     elif not problem.initial.y.any() and not any(
-        problem.t_stop <= wave.course[0] < math.inf for wave in problem.waveforms
+        problem.t_stop <= wave.course[0] < math.inf for wave in problem.network.waveforms
     ):
         yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"

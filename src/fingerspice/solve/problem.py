@@ -70,17 +70,9 @@ class Problem:
         vars(other).update(vars(self), t_out=t, left=left)
         return other
 
-    @property
+    @cached_property
     def network(self) -> Network:
         return self.scene.network
-
-    @property
-    def waveform(self) -> Waveform:
-        return self.scene.waveform
-
-    @property
-    def waveforms(self) -> tuple[Waveform, ...]:
-        return self.scene.waveforms
 
     @cached_property
     def largest(self) -> float:
@@ -104,11 +96,11 @@ class Problem:
 
     def breakpoints(self) -> FloatArray:
         """The sources' breakpoints in the run, s."""
-        return self.kept("breakpoints", lambda: self.waveform.breakpoints(self.t_start, self.t_stop))
+        return self.kept("breakpoints", lambda: self.network.waveform.breakpoints(self.t_start, self.t_stop))
 
     def kept(self, what: str, make: Callable[[], FloatArray], *how: Any) -> FloatArray:
         """Times that follow from the sources and the run; the waveform caches them if they are few."""
-        kept, key = self.waveform.kept, (what, self.t_start, self.t_stop, *how)
+        kept, key = self.network.waveform.kept, (what, self.t_start, self.t_stop, *how)
         found = kept_with(kept, key, 1, make)
         if found.size > KEPT:
             kept.pop(key, None)
@@ -141,7 +133,7 @@ def prepare(
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
-    tran, wave, stop = circuit.tran, scene.waveform, t_stop
+    tran, wave, stop = circuit.tran, scene.network.waveform, t_stop
     if stop is None:
         if tran is None and (t_eval is None or not t_eval.size):
             raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
@@ -199,12 +191,12 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
 
     Recordings have no jumps, so that rounding changes nothing.
     """
-    if all(isinstance(wave, (Samples, DC)) for wave in problem.waveforms):
+    if all(isinstance(wave, (Samples, DC)) for wave in problem.network.waveforms):
         return t
     span, moved = (problem.t_start, problem.t_stop), t
-    windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
+    windows = 1 + int((span[1] - span[0]) * problem.network.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
     for w0, w1 in itertools.pairwise(span if windows == 1 else np.linspace(*span, windows + 1)):
-        edges = problem.breakpoints() if windows == 1 else problem.waveform.breakpoints(w0, w1)
+        edges = problem.breakpoints() if windows == 1 else problem.network.waveform.breakpoints(w0, w1)
         if not edges.size:
             continue
         reach = same_time(1.0) * np.abs(edges)
@@ -219,7 +211,7 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
 
 def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[FloatArray, BoolArray]:
     """Output times (s) and whether each is left-hand: the given times, all right-hand, or the deck's."""
-    check_length(problem.waveform, problem.t_start, problem.t_stop)
+    check_length(problem.network.waveform, problem.t_start, problem.t_stop)
     if t_eval is not None:
         return t_eval, np.zeros(t_eval.size, bool)
     check_outputs(problem.circuit, (problem.t_stop - problem.first) / problem.step)
@@ -239,7 +231,7 @@ def _output_times(problem: Problem, jumps: str) -> FloatArray:
     if grid.size and abs(grid[-1] - problem.t_stop) <= 1e-9 * step:
         grid[-1] = problem.t_stop
     found = [np.empty(0)]
-    for wave in () if jumps == "none" else problem.waveforms:
+    for wave in () if jumps == "none" else problem.network.waveforms:
         edges = wave.breakpoints(problem.t_start, problem.t_stop + same_time(problem.t_stop))
         edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= first)]
         if edges.size:
@@ -276,7 +268,7 @@ class Tables:
     def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
         self.problem, self.no_chirps = problem, no_chirps
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
-        span, wave = problem.t_stop - problem.t_start, problem.waveform
+        span, wave = problem.t_stop - problem.t_start, problem.network.waveform
         # A function is sampled at the output step.
         longest = 4096.0 * problem.step if problem.scene.is_sampled else math.inf
         longest = min(longest, PERIODS_PER_WINDOW * wave.shortest_time())
@@ -294,9 +286,9 @@ class Tables:
         self.not_finite: float | None = None
         # Largest value (V or A) of each source in the windows so far, and among a few of its samples: a function that
         # rises out of next to nothing would be followed there beyond its own digits.
-        peaks = [wave.kept.get("peak", (None, 0.0))[1] for wave in problem.waveforms]
+        peaks = [wave.kept.get("peak", (None, 0.0))[1] for wave in problem.network.waveforms]
         self.scales = [peak if np.isfinite(peak) else 0.0 for peak in peaks]
-        kept: dict[Any, Any] | None = problem.waveform.kept if len(self.edges) <= 1 + KEPT_WINDOWS else None
+        kept: dict[Any, Any] | None = problem.network.waveform.kept if len(self.edges) <= 1 + KEPT_WINDOWS else None
         self.kept = {} if problem.scene.is_sampled else kept
 
     def __iter__(self) -> Iterator[list[SourceTable]]:
@@ -317,7 +309,7 @@ class Tables:
     def _tables(self, w0: float, w1: float) -> list[SourceTable]:
         problem, tables = self.problem, []
         make = partial(source_table, no_chirps=self.no_chirps, shortest=shortest_event(problem))
-        for place, (wave, scale) in enumerate(zip(problem.waveforms, self.scales, strict=True)):
+        for place, (wave, scale) in enumerate(zip(problem.network.waveforms, self.scales, strict=True)):
             table = make(wave, w0, w1, self.tol, problem.step, scale=scale)
             if is_sampled(wave):
                 off = table.unseen(wave, problem.t_out, self.tol)
@@ -329,14 +321,14 @@ class Tables:
         """Largest source voltage (V) of the run; of users' functions also between the samples that a scene knows."""
         problem = self.problem
         if not problem.scene.is_sampled:
-            return problem.scene.u_peak or problem.waveform.peak(problem.t_start, problem.t_stop)
+            return problem.scene.u_peak or problem.network.waveform.peak(problem.t_start, problem.t_stop)
         met = (table.scale for tables in self for table in tables[: problem.network.n_voltage])
         return max(met, default=0.0) or problem.scene.u_peak
 
 
 def shortest_event(problem: Problem) -> float:
     """Length (s) of the shortest event of a user's function that its samples surely meet."""
-    one_by_one = any(wave.kept.get("one by one") for wave in problem.waveforms)
+    one_by_one = any(wave.kept.get("one by one") for wave in problem.network.waveforms)
     return min(sampling.WIDEST * problem.step, math.inf if one_by_one else (problem.t_stop - problem.t_start) / LOOKS)
 
 
@@ -364,11 +356,11 @@ def after_the_end(problem: Problem) -> Sources | None:
     stop, step = problem.t_stop, problem.step
 
     def make() -> tuple[Sources, ...]:
-        if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
+        if not any(breakpoints_at(wave, stop).size for wave in problem.network.waveforms):
             return ()
-        return (joined([source_table(w, stop, stop + step, 1e-10, step) for w in problem.waveforms]),)
+        return (joined([source_table(w, stop, stop + step, 1e-10, step) for w in problem.network.waveforms]),)
 
-    found = kept_with(problem.waveform.kept, ("after", stop, step), 1, make)
+    found = kept_with(problem.network.waveform.kept, ("after", stop, step), 1, make)
     return found[0] if found else None
 
 

@@ -104,7 +104,8 @@ def excess_of(gaps: FloatArray, rounding: float) -> float:
 
 def closed_form(problem: Problem, again: Callable[[Problem], Run], error: float = 0.0) -> ClosedForm:
     """The run between its outputs, by a method that computes it `again` with any outputs; see `ClosedForm`."""
-    return ClosedForm(partial(_look, problem, again), problem.waveform, problem.t_start, error, problem.rounding)
+    look, wave = partial(_look, problem, again), problem.network.waveform
+    return ClosedForm(look, wave, problem.t_start, error, problem.rounding)
 
 
 def _look(problem: Problem, again: Callable[[Problem], Run], t: FloatArray, left: BoolArray) -> Record:
@@ -240,10 +241,10 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         element, device = ", ".join(_written(problem, place)), problem.network.sources[place].device
         cause += f" (by {off:.3g} {'A' if device == 'I' else 'V'})"
     elif status is Status.FOLD and run.t.size and record.fingers:
-        if run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size:
+        if run.t_failed is not None and breakpoints_at(problem.network.waveform, run.t_failed).size:
             cause += " (the source jumps past the fold at this time)"
         areas = record.each("area")
-        shrunk = [x[-1] / problem.scene.area0[j] for x, j in zip(areas, problem.network.fingers, strict=True)]
+        shrunk = [x[-1] / problem.scene.net.area0[j] for x, j in zip(areas, problem.network.fingers, strict=True)]
         i = int(np.argmin(shrunk))
         signals = record.each("u_gap")[i], areas[i], record.fold_margin
         element, (u_gap, area, margin) = names[i], (float(x[-1]) for x in signals)
@@ -274,11 +275,11 @@ def _measured(problem: Problem) -> list[str]:
 
 def _written(problem: Problem, place: int) -> list[str]:
     """Names of the deck's sources that are combined in source number `place` of the network."""
-    stack = problem.scene.stack
+    stack = problem.network.stack
     return [problem.network.sources[place].name] if stack is None else [e.name for e, _ in stack.sources]
 
 
 def _not_finite_at(problem: Problem, t: float) -> list[str]:
     """Names of the sources without a finite value at time t, s."""
-    broken = [i for i, wave in enumerate(problem.waveforms) if not np.isfinite(wave.value(t))]
+    broken = [i for i, wave in enumerate(problem.network.waveforms) if not np.isfinite(wave.value(t))]
     return [name for i in broken for name in _written(problem, i)]

@@ -21,7 +21,7 @@ from fingerspice.engine.one_area.system import build_system
 from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.waveforms.sampling import is_sampled
-from fingerspice.waveforms.waveform import Sum, Waveform, require
+from fingerspice.waveforms.waveform import Waveform, require
 
 # Error allowed for taking a dispersive skin's data at one frequency, relative to the error asked for.
 FREEZING_SHARE = 0.3
@@ -65,24 +65,9 @@ class Scene:
     prepared: dict[Any, Any] = field(default_factory=dict)
 
     @cached_property
-    def stack(self) -> Stack | None:
-        """The series stack, if the circuit is one."""
-        return self.network.stack
-
-    @cached_property
-    def waveforms(self) -> tuple[Waveform, ...]:
-        """Waveform of each source, V or A."""
-        return self.network.waveforms
-
-    @cached_property
-    def waveform(self) -> Waveform:
-        """All sources at once, for their common period, breakpoints and shortest time."""
-        return self.waveforms[0] if len(self.waveforms) == 1 else Sum(self.waveforms)
-
-    @cached_property
     def is_sampled(self) -> bool:
         """Whether some source is a user's function, which has to be sampled, not a waveform with a formula."""
-        return any(is_sampled(w) for w in self.waveforms)
+        return any(is_sampled(w) for w in self.network.waveforms)
 
     @cached_property
     def coupled(self) -> bool:
@@ -118,20 +103,16 @@ class Scene:
     def shown(self) -> Scene:
         """The scene in whose form exponential steps record a stack: a voltage for each layer, not for each cell."""
         # Not cached where it is this one: an object that holds itself is freed by garbage collection only.
-        if self.stack is None or (whole := self.stack.by_layer) is self.stack:
+        stack = self.network.stack
+        if stack is None or (whole := stack.by_layer) is stack:
             return self
         made = partial(replace, self, network=loop_network(whole), prepared={})
         return kept_with(self.prepared, ("shown",), 1, made)
 
     @cached_property
-    def area0(self) -> FloatArray:
-        """The areas, m^2: fixed ones, and those at 0 V of areas that follow their gap."""
-        return np.asarray(self.net.area0)
-
-    @cached_property
     def modes(self) -> Modes:
-        """Modes of the circuit with the areas `area0`."""
-        return self.modes_at(self.area0)
+        """Modes of the circuit with its fixed areas, and those at 0 V of areas that follow their gap."""
+        return self.modes_at(self.net.area0)
 
     @cached_property
     def rates(self) -> FloatArray:
@@ -156,8 +137,9 @@ class Scene:
     @cached_property
     def turn(self) -> FloatArray:
         """For a stack: sign of every live voltage relative to the direction of the loop, shape (n,)."""
-        assert self.stack is not None
-        return self.stack.sign[list(self.stack.state_order[:-1])]
+        stack = self.network.stack
+        assert stack is not None
+        return stack.sign[list(stack.state_order[:-1])]
 
     @cached_property
     def measured(self) -> tuple[int, ...]:
@@ -165,7 +147,7 @@ class Scene:
         gaps = tuple(gap for gap in self.network.gaps if gap is not None)
         if gaps or not self.network.cells:
             return gaps
-        return (int(np.argmin(self.network.capacitance(self.area0))),)
+        return (int(np.argmin(self.network.capacitance(self.net.area0))),)
 
 
 def scene_of(

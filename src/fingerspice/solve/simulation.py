@@ -219,7 +219,7 @@ def integrated(
     """A run as planned, with its stated error compared with `rtol`, and the name of its method."""
     name = plan.tier
     if name != "coupled":
-        leaks = name == "linear" and problem.scene.stack is not None
+        leaks = name == "linear" and problem.network.stack is not None
         run = solve_linear(problem, np.array([plan.area]) if leaks else None, plan.error_bound)
     else:
         run, name = _stepped(problem, method, own_rtol(problem, plan, rtol), progress)
@@ -238,12 +238,12 @@ def solution_of(
     """The solution made of a run and its record, with output times `t` (s); `name` is the method."""
     scene = problem.scene
     failure = None if run.status is Status.SUCCESS else run_failure(problem, run, record)
-    fundamental = scene.waveform.fundamental if len(scene.waveforms) == 1 else None
+    fundamental = scene.network.waveform.fundamental if len(scene.network.waveforms) == 1 else None
     return Solution(
         t=t, record=record, status=run.status, failure=failure, nfev=run.nfev, stats=dict(run.stats), error=run.error,
         rtol=rtol, charge_law=scene.charge_law, area_mode=scene.area_mode, method=name, plan=plan,
         circuit=problem.circuit, state=run.state, fold_margin_min=run.margin, fundamental=fundamental,
-        period=scene.waveform.period, warnings=tuple(run_warnings(problem, run, record)),
+        period=scene.network.waveform.period, warnings=tuple(run_warnings(problem, run, record)),
         first=max(problem.first, problem.t_start), t_stop=problem.t_stop, start=problem.start,
         continuous=run.continuous if run.t_failed is None else None,
     )  # fmt: skip
@@ -255,7 +255,7 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
         return solve_foreign(problem, method, rtol, progress), method
     if method == "auto" and (recorded := solve_recording(problem, rtol, progress)) is not None:
         return recorded, "relaxation"
-    is_stack, reason = problem.scene.stack is not None, ""
+    is_stack, reason = problem.network.stack is not None, ""
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, progress, repeat=method == "auto")
         if run.status not in (BEYOND_STACKS if is_stack else BEYOND_NETWORKS) or (is_stack and method == "exponential"):
@@ -287,7 +287,7 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
         kept = run.t < run.t_failed
         run.t, run.left, run.rows = run.t[kept], run.left[kept], run.rows[kept]
     # Of a function that gives coarser numbers than doubles, their rounding is part of the stated error, and no failure.
-    coarse = run.rough if any(wave.precision > DOUBLE for wave in problem.waveforms) else 0.0
+    coarse = run.rough if any(wave.precision > DOUBLE for wave in problem.network.waveforms) else 0.0
     if run.rough > 0.0:
         # What it does to the charge is not known.
         run.charge_error = None

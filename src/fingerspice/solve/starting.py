@@ -4,12 +4,9 @@ The live voltages along the loop are k U + v. The stack's own state x is v under
 (see `engine.one_area.model`). The charge delivered by the source is z under `local`, and z + A U / S under `mobile`.
 
 A run starts from an earlier solution, or from the capacitors' voltages at t = 0 by the deck, made consistent with
-Kirchhoff's voltage law. The rules are those of SPICE, compared with ngspice 39:
-
-- With ``uic`` each capacitor has the voltage of its ``IC=``, else the difference of its nodes' ``.ic``, else 0 V.
-- Without ``uic`` the start is the DC operating point with the nodes of ``.ic`` held, which are then released; ``IC=``
-  has no effect. A voltage source overrides ``.ic``; for nodes tied together by voltage sources, the mean is used.
-- ``.ic`` of an area node (mm^2) holds the area in the operating point, and starts an area with a time constant.
+Kirchhoff's voltage law. The rules are those of SPICE (docs/netlist.md), compared with ngspice 39. A voltage source
+overrides ``.ic``; for nodes tied together by voltage sources, the mean is used. ``.ic`` of an area node (mm^2) holds
+the area in the operating point, and starts an area with a time constant.
 
 Start voltages that contradict Kirchhoff's voltage law settle at once: charge flows round the loops of capacitors and
 sources as if through vanishing resistances, and is conserved on every island of nodes. With fixed areas the result
@@ -69,7 +66,7 @@ def to_loop(scene: Scene, state: State) -> tuple[FloatArray, float]:
 
 def from_loop(scene: Scene, t: float, y: FloatArray, before: float, u_gap: float) -> State:
     """The state used for all circuits, from that of `to_loop` at time t (s), with `before` (V) around the loop."""
-    model, stack, sign, scale, y = model_of(scene), scene.stack, 0.0, 1.0, y.copy()
+    model, stack, sign, scale, y = model_of(scene), scene.network.stack, 0.0, 1.0, y.copy()
     if model.mobile:
         inverse = inverse_area(abs(u_gap), model.curve)[0]
         scale = model.area0 * inverse
@@ -82,10 +79,10 @@ def from_loop(scene: Scene, t: float, y: FloatArray, before: float, u_gap: float
 
 def as_shown(scene: Scene, row: FloatArray) -> FloatArray:
     """A row as in `Record` with a voltage for each layer in place of each cell, as in `Scene.shown`."""
-    if scene.stack is None or scene.shown is scene:
+    if scene.network.stack is None or scene.shown is scene:
         return row
     n = scene.turn.size
-    return np.append(scene.shown.turn * (scene.stack.grouping @ (scene.turn * row[:n])), row[n:])
+    return np.append(scene.shown.turn * (scene.network.stack.grouping @ (scene.turn * row[:n])), row[n:])
 
 
 def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> State:
@@ -125,18 +122,18 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
 
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Cell voltages (V), areas (m^2) and sources at the DC operating point (at 0-), the nodes in `initial` held."""
-    net, stack = scene.net, scene.stack
-    s = np.array([float(w.value(0.0, "left")) for w in scene.waveforms])
+    net, stack = scene.net, scene.network.stack
+    s = np.array([float(w.value(0.0, "left")) for w in scene.network.waveforms])
     if stack is not None and scene.model is not None and not initial:
         order = list(stack.state_order)
-        return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.area0, s
+        return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.net.area0, s
     conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in scene.network.areas}
     added = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
     # The reduced network of a series loop has no nodes, so the operating point needs the unreduced network.
     rebuilt = stack is not None or added
     network = build_network(replace(circuit, work="gap"), added) if rebuilt else scene.network
     sources = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
-    area, follows = scene.area0.copy(), net.gap >= 0
+    area, follows = scene.net.area0.copy(), net.gap >= 0
     held = np.array([a.node in initial for a in network.areas], bool) & follows
     area[held] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, held, strict=True) if mark]
     _refuse_floating_at_dc(network, area)
@@ -185,7 +182,7 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
     if s is None and q.size and np.any(rest):
         # The values that agree with the cell voltages in the least-squares sense.
         before = np.asarray(np.linalg.lstsq(q, rest, rcond=None)[0], float)
-    after = np.array([float(w.value(0.0)) for w in scene.waveforms])
+    after = np.array([float(w.value(0.0)) for w in scene.network.waveforms])
     # The run itself reports a source that is not finite.
     after[~np.isfinite(after)] = 0.0
     if float(np.abs(rest - q @ before).max(initial=0.0)) > ROUNDING * float(np.abs(u).max(initial=0.0)):

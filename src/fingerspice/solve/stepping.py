@@ -72,8 +72,8 @@ class Stepping(Integration):
         self.control = self.controls[0]
         self.control["t"] = problem.t_start
         super().__init__(problem)
-        span, self.period = problem.t_stop - problem.t_start, problem.waveform.period or math.inf
-        longest = min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
+        span, self.period = problem.t_stop - problem.t_start, problem.network.waveform.period or math.inf
+        longest = min(LONGEST_STEP * problem.network.waveform.shortest_time(), span, problem.max_step)
         self.pace = Pace(tol, longest, True, problem.charge)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.step = np.zeros(1, readout.STEP)
@@ -89,7 +89,7 @@ class Stepping(Integration):
     def look_for_period(self, rates: FloatArray, scale: FloatArray, repeat: bool) -> None:
         """Prepare the looks of the run, none unless it is to `repeat` a period; `rates` (1/s) are those at 0 V."""
         problem, values = self.problem, np.zeros(loop.N_VALUES)
-        start, live = max(problem.t_start, problem.waveform.settled), rates[rates > 0.0]
+        start, live = max(problem.t_start, problem.network.waveform.settled), rates[rates > 0.0]
         values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, self.period
         values[loop.ALLOWED], values[loop.HAS_CHARGE] = _SHARE * self.pace.tol, problem.charge
         values[loop.LOOKED] = -1.0
@@ -173,7 +173,7 @@ class Stepping(Integration):
         if not self.pace.charge:
             return
         # Errors of unknown sign are the same in every period: they add up from one to the next, instead of cancelling.
-        period, steps = self.problem.waveform.period, 1.0 + float(self.counters[readout.ACCEPTED])
+        period, steps = self.problem.network.waveform.period, 1.0 + float(self.counters[readout.ACCEPTED])
         alike = (self.t - self.problem.t_start) / period - self.repeated if period else 0.0
         known, spread = float(self.control["error_q"]), max(self.collected[1].tolist(), default=0.0)
         estimate = SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
@@ -267,4 +267,4 @@ class Stepping(Integration):
 
 def _record(shown: Scene, t: FloatArray, left: BoolArray, rows: FloatArray) -> Record:
     """A record without charge from recorded states, shape (n_t, size), which of a stack are counted along the loop."""
-    return Record(shown.network, shown.net, t, left, rows if shown.stack is None else shown.turn * rows)
+    return Record(shown.network, shown.net, t, left, rows if shown.network.stack is None else shown.turn * rows)

@@ -58,7 +58,7 @@ class Outputs:
 
 def outputs_of(problem: Problem, step: float | None) -> Outputs:
     """The outputs at the samples of a recording, or every `step` (s); the deck's TSTEP where there is no recording."""
-    wave, first, stop = problem.waveform, max(problem.first, problem.t_start), problem.t_stop
+    wave, first, stop = problem.network.waveform, max(problem.first, problem.t_start), problem.t_stop
     if step is None and isinstance(wave, Samples):
         low = math.ceil((first - wave.start) * wave.rate - 1e-6)
         total = math.floor((stop - wave.start) * wave.rate + 1e-6) - low + 1
@@ -196,7 +196,7 @@ class Stream:
         """Times (s) and rows of the next window."""
         end = min(self._written + WINDOW, self.outputs.total)
         t, whole = self.outputs.times(self._written, end), self.problem
-        stop = whole.t_stop if end == self.outputs.total else on_breakpoint(whole.waveform, float(t[-1]))
+        stop = whole.t_stop if end == self.outputs.total else on_breakpoint(whole.network.waveform, float(t[-1]))
         start, state = self._state.t, self._state
         scene = replace(whole.scene, network=within(whole.network, start, stop + whole.step))
         problem = replace(whole, scene=scene, t_start=start, t_stop=stop, first=start, initial=state)
@@ -299,7 +299,7 @@ def stream(
         require(chunk is None, "count", "given beside chunk", "one of them")
     circuit = overridden(circuit, sources, parameters)
     problem = asked(circuit, t_stop=t_stop, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol)
-    check_length(problem.waveform, problem.t_start, problem.t_stop)
+    check_length(problem.network.waveform, problem.t_start, problem.t_stop)
     outputs = outputs_of(problem, step)
     if count is None:
         spacing = 1.0 / outputs.over if outputs.rated else outputs.over

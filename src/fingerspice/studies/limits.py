@@ -383,7 +383,7 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
         raised = circuit.varied({name: Product((by, wave)) for name, wave in waves.items()})
         try:
             problem = prepare(raised, t_stop=t_stop, charge_law="mobile", charge=False, rtol=RTOL)
-            if problem.scene.stack is not None and (met := meets_fold(problem, RTOL)) is not None:
+            if problem.network.stack is not None and (met := meets_fold(problem, RTOL)) is not None:
                 return met
             # Not by `simulate`, which would warn about voltages that the user did not ask for.
             run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)

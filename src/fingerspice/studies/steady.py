@@ -20,7 +20,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element
 from fingerspice.circuit.describe import Parameters, Sources, area_given, head_lines, overridden, require_circuit
 from fingerspice.circuit.devices import beyond_fingers
-from fingerspice.circuit.network import build_network, linear_scene, phasor_areas, with_skin_held
+from fingerspice.circuit.network import build_network, linear_scene, network_of, phasor_areas, with_skin_held
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.plots import drawing, traces
 from fingerspice.results import summary
@@ -28,7 +28,7 @@ from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Sensitivity, Solution
 from fingerspice.results.spectrum import PhasorSolution
 from fingerspice.results.steps import weigh_outputs
-from fingerspice.solve.derivatives import check_request, period_of, sensitivities_of
+from fingerspice.solve.derivatives import check_request, sensitivities_of
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.runs import Progress
@@ -230,8 +230,8 @@ class SteadyState(Shown, summary.Figured):
     @property
     def period(self) -> float:
         """Period of the source, s."""
-        assert self.problem.waveform.period is not None
-        return self.problem.waveform.period
+        assert self.problem.network.waveform.period is not None
+        return self.problem.network.waveform.period
 
     @cached_property
     def map_slope(self) -> FloatArray:
@@ -325,7 +325,7 @@ def steady_state(
     """
     rtol, points = rtol_given(rtol), whole_number("points", points, 1)
     circuit = overridden(circuit, sources, parameters)
-    period = period_of(circuit)
+    period = network_of(circuit).waveform.period
     if period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
     problem = prepare(circuit, t_stop=period, charge_law=charge_law, area=area, start="periodic", charge=charge)

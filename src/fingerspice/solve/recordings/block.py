@@ -363,10 +363,10 @@ def driving(problem: Problem) -> tuple[int, Samples | PWL | None]:
 
     For a stack it may also be a PWL with many points, without jump in the run.
     """
-    wave = problem.waveform
-    if problem.scene.stack is not None and isinstance(wave, PWL) and wave.repeat is None and as_samples(wave) is None:
+    network, wave = problem.network, problem.network.waveform
+    if network.stack is not None and isinstance(wave, PWL) and wave.repeat is None and as_samples(wave) is None:
         return 0, wave if _points(problem, wave).size else None
-    on = [(i, as_samples(w)) for i, w in enumerate(problem.waveforms) if not (isinstance(w, DC) and w.level == 0.0)]
+    on = [(i, as_samples(w)) for i, w in enumerate(network.waveforms) if not (isinstance(w, DC) and w.level == 0.0)]
     return on[0] if len(on) == 1 else (0, None)
 
 
@@ -374,9 +374,9 @@ def ready(problem: Problem, rtol: float) -> LaneForm | None:
     """The scene prepared for recordings, and cached; None where lanes do not apply to it."""
     scene, decade = problem.scene, float(10.0 ** np.floor(np.log10(rtol)))
     key: tuple[Any, ...] = "followed", decade, problem.charge, threading.get_ident()
-    if scene.stack is not None:
+    if scene.network.stack is not None:
         key = *key, scene.charge_law, rounded_peak(scene.u_peak)
-        return kept_with(scene.stack.kept, key, MOST_FORMS, lambda: stack(problem, decade))
+        return kept_with(scene.network.stack.kept, key, MOST_FORMS, lambda: stack(problem, decade))
     source, wave = driving(problem)
     assert isinstance(wave, Samples)
     return kept_with(scene.prepared, key, MOST_FORMS, partial(finger, problem, decade, source, wave))
@@ -420,11 +420,11 @@ def pieces_of(problem: Problem) -> list[Piece]:
         return [Piece(float(points[a]), spacing, times=points[a : b + 1]) for a, b in itertools.pairwise(edges)]
     spacing, t0, t1 = 1.0 / wave.rate, problem.t_start, problem.t_stop
     first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
-    of_samples = any(isinstance(one, Samples) for one in problem.waveforms)
+    of_samples = any(isinstance(one, Samples) for one in problem.network.waveforms)
     # In a PWL with few points the source is one long line in most of the run, of which other methods need few steps.
     if last - first < LEAST_SAMPLES or not (of_samples or last - first <= MOST_PER_POINT * problem.breakpoints().size):
         return []
-    grows, begin, end = problem.scene.stack is None, wave.start + first * spacing, wave.start + last * spacing
+    grows, begin, end = problem.network.stack is None, wave.start + first * spacing, wave.start + last * spacing
     early = begin - t0 > 1e-6 * spacing
     edges = [first, *range((first // PIECE + 1) * PIECE, last, PIECE), last]
     if grows and not early:

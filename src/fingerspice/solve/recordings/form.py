@@ -295,7 +295,7 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
     scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
     peak = rounded_peak(scene.u_peak)
     system = system_of(scene, decade, BEYOND_PEAK * peak, _ONE_REFERENCE, peak)
-    model, q0, stack = system.model, float(system.q0[0]), scene.stack
+    model, q0, stack = system.model, float(system.q0[0]), scene.network.stack
     found = curves(model.curve, q0, 0.0, system.u_top, rtol)
     assert stack is not None
     if found is None or stack.gap is None or (stack.g_area[stack.gap] > 0.0 and not model.mobile):
@@ -439,7 +439,7 @@ def is_followed(scene: Scene, circuit: Circuit) -> bool:
     """Whether a scene is a network with one area that moves, at once and under the local law, of cells in series."""
     net = scene.net
     moving = np.flatnonzero(net.gap >= 0)
-    if scene.stack is not None or net.mobile or moving.size != 1 or net.slow[moving[0]] >= 0:
+    if scene.network.stack is not None or net.mobile or moving.size != 1 or net.slow[moving[0]] >= 0:
         return False
     cells = [cell for cell in scene.network.cells if cell.area == moving[0]]
     if net.g_area[net.gap[moving[0]]] > 0.0:
@@ -479,7 +479,7 @@ class NetworkForm(LaneForm):
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
         shown, xi, y = self.rows, self.xi_at(z, u_last), problem.initial.y.copy()
         y[: shown.k.size] = shown.columns @ z + shown.bends * float(self.bend(np.array(xi))) + shown.k * u_last
-        s, sign = np.zeros(len(problem.waveforms)), np.ones(problem.scene.net.gap.size)
+        s, sign = np.zeros(len(problem.network.waveforms)), np.ones(problem.scene.net.gap.size)
         s[self.reduced.source], sign[self.reduced.moving] = u_last, 1.0 if xi >= 0.0 else -1.0
         return State(t, y, s, sign, problem.scene.charge_law)
 
@@ -495,13 +495,13 @@ def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> Network
     if not is_followed(scene, problem.circuit):
         return None
     # The gap's largest share of a sine of the source, over the frequencies that a recording may have.
-    one, lowest = Reduced(scene, source, scene.area0, False), min(1.0 / problem.t_stop, 0.4 * wave.rate)
+    one, lowest = Reduced(scene, source, scene.net.area0, False), min(1.0 / problem.t_stop, 0.4 * wave.rate)
     omega = 2.0 * np.pi * np.geomspace(lowest, 0.5 * wave.rate, _FREQUENCIES)
     response = one.k + (one.shape * one.gain / (1j * omega[:, None] + one.rates)).sum(axis=1)
     share, moving = float(np.abs(response).max()), one.moving
     # The peak of a current is not known to the scene; that of a voltage has been looked up in the file already.
     typical = _TYPICAL * min(scene.u_top, share * (scene.u_peak or wave.peak(0.0, problem.t_stop)))
-    area0 = scene.area0.copy()
+    area0 = scene.net.area0.copy()
     area0[moving] = 1.0 / inverse_area(typical, scene.net.curves[moving])[0]
     one = Reduced(scene, source, area0, problem.charge)
     polynomials = curves(scene.net.curves[moving], one.q0, one.kappa, scene.u_top, rtol)

@@ -255,7 +255,7 @@ class LaneMarch:
         stats = {"steps": self.steps, "rejected": self.refused, "zeros": 0}
         run = Run(t, left, rows, Status.SUCCESS, self.evaluated, stats, self.state)
         run.gaps, run.node_error, run.charge_error = self._stated(self.errors, self.peak)
-        run.margin, run.by_layer = self.margin, self.problem.scene.stack is not None
+        run.margin, run.by_layer = self.margin, self.problem.network.stack is not None
         return run
 
 
