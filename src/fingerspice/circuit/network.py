@@ -294,7 +294,7 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
     """The network of a circuit; with `skin_at`, dispersive skins of a stack have their data at that frequency (Hz)."""
 
     def make() -> Network:
-        if not statespace.is_stack(circuit):
+        if statespace.loop_of(circuit) is None:
             network = shared(circuit, "network", lambda: build_network(circuit))
             now = {e.name: e for e in circuit.elements}
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
@@ -309,7 +309,7 @@ def checked(circuit: Circuit) -> Circuit:
     """The circuit, refused if a value is not allowed or it has no solution."""
     check(circuit)
     # Of a stack the network follows from its cells, and cannot fail.
-    (build_stack if statespace.is_stack(circuit) else network_of)(circuit)
+    (build_stack if statespace.loop_of(circuit) else network_of)(circuit)
     return circuit
 
 

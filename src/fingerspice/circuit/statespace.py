@@ -97,7 +97,7 @@ def shared(circuit: Circuit, key: Any, make: Callable[[], T]) -> T:
 
 
 def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
-    """The hops and the area of a circuit that is one series loop of sources and layers, from ground back to ground.
+    """The hops and the area of a stack, a circuit of one series loop of sources and layers, from ground to ground.
 
     None for any other circuit, and for an area that follows with delay. Related circuits share the way round the loop.
     """
@@ -412,11 +412,6 @@ def contact_of(gap: Element) -> Contact:
         raise InputError(f"{what}; allowed: fn, alpha, m_exp, beta, n_exp nearer to Table 1's", gap.where)
 
     return gap.remember("contact", make)
-
-
-def is_stack(circuit: Circuit) -> bool:
-    """Whether a circuit is a stack (see `loop_of`); one that `find_branches` refuses is refused."""
-    return loop_of(circuit) is not None
 
 
 def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:

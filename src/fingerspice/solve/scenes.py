@@ -14,7 +14,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, T
 from fingerspice.circuit.describe import COUPLING, freezing_error
 from fingerspice.circuit.network import Modes, Network, loop_network, mean_areas, network_modes, network_of
-from fingerspice.circuit.statespace import Stack, build_stack, is_stack
+from fingerspice.circuit.statespace import Stack, build_stack, loop_of
 from fingerspice.engine.network import Net
 from fingerspice.engine.one_area.model import Model
 from fingerspice.engine.one_area.system import build_system
@@ -182,7 +182,7 @@ def scene_of(
 
 def _freezing(circuit: Circuit, stop: float, rtol: float) -> tuple[float, float] | None:
     """`Scene.skin`, if the error is small compared with `rtol`."""
-    if not circuit.by_device("SKIN_DISPERSIVE") or not is_stack(circuit):
+    if not circuit.by_device("SKIN_DISPERSIVE") or loop_of(circuit) is None:
         return None
     stack, allowed = build_stack(circuit), FREEZING_SHARE * rtol
     if stack.contact is None or not (math.isfinite(stop) and stop > 0.0):

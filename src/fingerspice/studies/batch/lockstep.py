@@ -14,7 +14,7 @@ from numpy.polynomial import chebyshev as powers
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import Value
-from fingerspice.circuit.statespace import Stack, build_stack, is_stack
+from fingerspice.circuit.statespace import Stack, build_stack, loop_of
 from fingerspice.engine.lockstep.card import march_on_card
 from fingerspice.engine.lockstep.march import N_PORTION, march, march_samples
 from fingerspice.engine.lockstep.scenes import CELL_ROWS, LARGEST_X, LOAD, LOSS, OMEGA, REST, STRESS, new_block
@@ -107,7 +107,7 @@ class LockstepForm:
 
 def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str:
     """The common form of scenes in lockstep, or the reason why there is none; `varied` has the paths that vary."""
-    if not is_stack(circuit):
+    if loop_of(circuit) is None:
         return "the circuit is no series stack of layers"
     stack, tran = build_stack(circuit), circuit.tran
     if stack.contact is None or stack.gap is None or stack.gap_layer is None or stack.area_given is not None:

@@ -18,7 +18,7 @@ from fingerspice.base.pages import Page
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
+from fingerspice.circuit.statespace import build_stack, contact_of, loop_of
 from fingerspice.physics.contact import Contact, ridge_area
 from fingerspice.studies.fit.fitting import NOT_FOUND, SIGMA, FitResult, Fitted, Given, Problem, followed, measured_of
 from fingerspice.waveforms.waveform import refuse, require
@@ -131,7 +131,7 @@ class Task(Problem):
     def predict(self, values: FloatArray) -> list[FloatArray]:
         """Each relation's values as the contact has them."""
         changed = self.circuit.varied(dict(zip(self.names, values.tolist(), strict=True)))
-        own = build_stack(changed).contact if is_stack(changed) else None
+        own = build_stack(changed).contact if loop_of(changed) else None
         contact = contact_of(changed[self.gap]) if own is None else own
         return [relation.predicted(contact) for relation in self.relations]
 
