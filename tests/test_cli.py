@@ -317,7 +317,7 @@ def test_a_store_that_another_process_writes_is_refused(command: Command, monkey
         shutil.copytree("pad.zarr", "out/pad.zarr")
         create(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("fingerspice.cli.store.create", late)
+    monkeypatch.setattr("fingerspice.results.runfile.create", late)
     done = command(*words)
     assert (done.code, done.out) == (2, "")
     assert busy in done.lines[-1]

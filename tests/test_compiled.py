@@ -152,7 +152,7 @@ sweep.stop()
 """
 LINES = [
     "fingerspice: note: compiling the steps of a series stack, about 30 s, only once: later runs find it on the disk",
-    "fingerspice: note: compiling the steps of a network, about 60 s, only once: later runs find it on the disk",
+    "fingerspice: note: compiling the steps of a network, about 40 s, only once: later runs find it on the disk",
 ]
 
 

@@ -14,7 +14,7 @@ _LOG = logging.getLogger("fingerspice")
 #: on one core of an x86-64 server of 2026.
 LONG = {
     ("engine.collocation.loop.march_on", "OneArea"): "the steps of a series stack, about 30 s",
-    ("engine.collocation.loop.march_on", "ManyAreas"): "the steps of a network, about 60 s",
+    ("engine.collocation.loop.march_on", "ManyAreas"): "the steps of a network, about 40 s",
     ("engine.lanes.loops.span", "StackMarks"): "the steps of a recording, about 10 s",
     ("engine.lanes.loops.span", "MobileMarks"): "the steps of a recording, about 10 s",
     ("engine.lanes.loops.span", "NetworkMarks"): "the steps of a recording in a network, about 20 s",
