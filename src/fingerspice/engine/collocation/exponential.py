@@ -12,7 +12,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
-from fingerspice.engine.collocation.readout import Modal
+from fingerspice.engine.collocation.readout import Modal, row_of
 from fingerspice.engine.many_areas.form import evaluate_many, probe_many
 from fingerspice.engine.one_area.rows import evaluate_one, largest_size, probe_one
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
@@ -282,7 +282,7 @@ def carry(circuit: Any, state: Any, gap: FloatArray, answer: float) -> None:
         largest_u = max(largest_u, largest_size(x.u[a]))
     for k in range(w.shape[0]):
         for p in range(4):
-            carried[k, p] = decay[k, FIRST + p if p < 3 else END] * error[k]
+            carried[k, p] = decay[k, row_of(p + 1)] * error[k]
         for a in range(gap.shape[0]):
             # A slow area is a mode behind the others, in units of its area at 0 V.
             reach = max(reach, abs((gap[a, k] if k < gap.shape[1] else largest_u) * error[k]))
@@ -305,7 +305,7 @@ def carry(circuit: Any, state: Any, gap: FloatArray, answer: float) -> None:
             break
     for k in range(w.shape[0]):
         for p in range(4):
-            carried[k, p] = off[k, FIRST + p if p < 3 else END] / scale
+            carried[k, p] = off[k, row_of(p + 1)] / scale
 
 
 @jit_within

@@ -221,7 +221,7 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
             places[k, p + 1] += mode[p]
     worst, magnified, run[0] = 0.0, 1.0, 0.0
     for p in range(4):
-        row = FIRST + p if p < 3 else END
+        row = readout.row_of(p + 1)
         factor = 1.0
         if mobile:
             # The modes' part of the gap voltage is multiplied by A_0 / A, and its error grows near the fold.
