@@ -219,12 +219,12 @@ def test_what_a_circuit_remembers_may_go_while_another_thread_asks_for_it() -> N
             self.asked += 1
             if self.asked == self.moment:
                 # As another thread would between two looks at it.
-                circuit._memory.clear()
+                circuit.kept.clear()
             return 7
 
     for moment in range(2, 9):
         key = Key(moment)
-        assert [circuit.remember(key, lambda: None) for _ in range(3)] == 3 * [None]
+        assert [circuit.remember(("any", key), lambda: None) for _ in range(3)] == 3 * [None]
 
 
 def test_scipys_methods_in_threads_leave_the_warning_filters_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:

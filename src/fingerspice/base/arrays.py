@@ -1,4 +1,4 @@
-"""Types of numpy arrays, the numbers that a user gives, several arrays in one, and memory that a process keeps."""
+"""Types of numpy arrays, the numbers that a user gives, several arrays in one, and what objects and a process keep."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import ctypes
 import math
 import os
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from functools import cache
+from functools import cache, cached_property
 from numbers import Real
 from typing import Any, TypeVar
 
@@ -22,6 +22,7 @@ ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 _NO_NUMBERS = {"c": "complex numbers", "b": "booleans", "U": "texts", "S": "texts", "M": "dates", "m": "durations"}
+T = TypeVar("T")
 Array = TypeVar("Array", bound=np.ndarray[Any, Any])
 
 
@@ -104,6 +105,33 @@ def views_of(shapes: Sequence[tuple[int, ...]]) -> tuple[FloatArray, list[FloatA
     ends = np.cumsum([math.prod(shape) for shape in shapes])
     numbers = np.zeros(ends[-1] if len(ends) else 0)
     return numbers, [part.reshape(shape) for part, shape in zip(np.split(numbers, ends)[:-1], shapes, strict=True)]
+
+
+class Remembering:
+    """An object that does not change, and remembers what follows from it; a pickled one does not."""
+
+    @cached_property
+    def kept(self) -> dict[Any, Any]:
+        """What follows from the object, by key; it may be shared by objects that differ in something else only."""
+        return {}
+
+    def remember(self, key: tuple[Any, ...], make: Callable[[], T], most: int = 16) -> T:
+        """The result of `make`, kept by its key, of which at most `most` share the first part; else all of these go.
+
+        Other threads may remove entries at any time, so that an entry is looked up only once.
+        """
+        found: tuple[T] | None = self.kept.get(key)
+        if found is None:
+            alike = [name for name in list(self.kept) if name[0] == key[0]]
+            for name in alike if len(alike) >= most else ():
+                self.kept.pop(name, None)
+            # Two threads may both call `make`, with the same result.
+            found = self.kept[key] = (make(),)
+        return found[0]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is computed when it is first asked for."""
+        return {k: v for k, v in vars(self).items() if not isinstance(getattr(type(self), k, None), cached_property)}
 
 
 @cache

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any
 
-from fingerspice.base.arrays import real_number
+from fingerspice.base.arrays import Remembering, real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.pages import Page, Shown
 from fingerspice.base.units import parse_number
@@ -22,7 +22,6 @@ from fingerspice.waveforms.waveform import Waveform, as_waveform, refuse, requir
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
-T = TypeVar("T")
 #: A value in the netlist's unit, as a number or text, or a source's waveform or function of time (s); by path.
 Change = float | str | Waveform | Callable[[float], float]
 Changes = Mapping[str, Change]
@@ -46,7 +45,7 @@ class SmallSignal:
 
 
 @dataclass(frozen=True, repr=False)
-class Element:
+class Element(Remembering):
     """One device of a circuit."""
 
     name: str  # As written; of an element of a subcircuit with its path, as in ``Xfinger.Xgap``
@@ -65,7 +64,7 @@ class Element:
         return f"<{' '.join([self.device, self.name, *self.node_names, values_text(self)]).rstrip()}>"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**{k: v for k, v in vars(self).items() if k != "kept"}, "values": dict(self.values)}
+        return {**super().__getstate__(), "values": dict(self.values)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update({**state, "values": MappingProxyType(state["values"])})
@@ -81,13 +80,6 @@ class Element:
         found = {p.name: Parameter(self.values[p.name], p.unit) for p in self.spec.parameters}
         wave, units = self.waveform, {} if self.waveform is None else type(self.waveform).units
         return found | {x: Parameter(getattr(wave, x), unit) for x, unit in units.items() if hasattr(wave, x)}
-
-    def remember(self, key: Any, make: Callable[[], T]) -> T:
-        """The result of `make`, which depends on this element alone, for all circuits that contain it."""
-        kept: dict[Any, T] = vars(self).setdefault("kept", {})
-        if key not in kept:
-            kept[key] = make()
-        return kept[key]
 
 
 @dataclass(frozen=True)
@@ -120,7 +112,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, repr=False)
-class Circuit(Shown):
+class Circuit(Remembering, Shown):
     """A netlist, read.
 
     Attributes
@@ -165,26 +157,14 @@ class Circuit(Shown):
     overrides: Mapping[str, str] = field(default_factory=dict)
     sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     related: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    _memory: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "related": {}, "_memory": {}}
+        return {**super().__getstate__(), "related": {}}
 
     def _page(self) -> Page:
         from fingerspice.circuit.describe import circuit_page
 
         return circuit_page(self)
-
-    def remember(self, key: Any, make: Callable[[], T]) -> T:
-        """The result of `make`, cached by the key; this is safe because circuits do not change."""
-        kept: tuple[T] | None = self._memory.get(key)
-        if kept is None:
-            # Two threads may both call `make`, with the same result.
-            self._memory[key] = kept = (make(),)
-            # Drop the oldest entries, so that a sweep over stop times cannot fill the memory.
-            for oldest in list(self._memory)[:-16]:
-                self._memory.pop(oldest, None)
-        return kept[0]
 
     def __getitem__(self, name: str) -> Element:
         """The element of that name, in upper or lower case.

@@ -30,7 +30,7 @@ from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.periodic import PWL, Burst, Repeat
 from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.sampling import Function
-from fingerspice.waveforms.waveform import DC, Product, Sum, Waveform, require
+from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, require
 
 
 def remembering(circuit: Circuit, name: str, values: Mapping[str, Any]) -> Circuit:
@@ -110,7 +110,7 @@ def drive_text(circuit: Circuit) -> str:
     Sources that were replaced are left out, since `changes_text` lists them.
     """
     replaced = {path.lower() for path in circuit.overrides} - _given_by_sets(circuit)
-    on = (e for e in driving(circuit) if e.waveform not in (None, DC(0.0)) and e.name.lower() not in replaced)
+    on = (e for e in driving(circuit) if e.waveform not in (None, OFF) and e.name.lower() not in replaced)
     return _joined([f"{e.name}: {_own_text(e)}" for e in on])
 
 
@@ -210,7 +210,7 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
         if circuit[name].device not in "VI":
             raise InputError(f"sources names {name!r}, which is a {circuit[name].device}; allowed: a V or I element")
     named = {name.lower() for name in sources}
-    on = [e.name for e in driving if e.name.lower() not in named and e.waveform not in (None, DC(0.0))]
+    on = [e.name for e in driving if e.name.lower() not in named and e.waveform not in (None, OFF)]
     if on and any(e.name.lower() in named for e in driving):
         only, stay = ", ".join(sources), ", ".join(on)
         text = f"sources names {only} only: {stay} stays on, as in the deck; 0 would switch it off"
@@ -468,7 +468,7 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
         except np.linalg.LinAlgError:
             return None
 
-    squares = shared(circuit, "squared gains", squared_gains)
+    squares = shared(circuit, ("squared gains",), squared_gains)
     f, energy = _recorded(waveform, t_stop) or _energies(waveform, t_stop, SKIN_BAND[1])
     if squares is None or f.size < 2:
         return None

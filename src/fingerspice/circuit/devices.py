@@ -235,7 +235,7 @@ def unusual_of_changed(before: Circuit, after: Circuit) -> tuple[dict[str, str],
     found: tuple[dict[str, str], dict[str, str]] = {}, {}
     for pair in zip(before.elements, after.elements, strict=True):
         for e, texts in zip(pair, found, strict=True) if pair[0] is not pair[1] else ():
-            for name, text in e.remember("unusual", lambda e=e: tuple(unusual(e))):  # type: ignore[misc]
+            for name, text in e.remember(("unusual",), lambda e=e: tuple(unusual(e))):  # type: ignore[misc]
                 texts[text] = f"{e.name}.{name}".lower()
     return found
 
@@ -251,7 +251,7 @@ def concerns(warning: str, changes: Mapping[str, Any]) -> bool:
 def check(circuit: Circuit) -> None:
     """Refuse values out of range and contacts that cannot exist."""
     for element in circuit.elements:
-        element.remember("checked", partial(_check_element, element))
+        element.remember(("checked",), partial(_check_element, element))
     if circuit.tran is not None and not circuit.tran.stop > 0.0:
         raise InputError(f"t_stop is {circuit.tran.stop:g} s; allowed: more than 0")
 

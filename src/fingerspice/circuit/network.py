@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import ComplexArray, FloatArray
+from fingerspice.base.arrays import ComplexArray, FloatArray, Remembering
 from fingerspice.base.errors import InputError
 from fingerspice.circuit import statespace
 from fingerspice.circuit.circuit import Circuit, Element
@@ -48,7 +48,7 @@ class Cell(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Network:
+class Network(Remembering):
     """A connected network of capacitors, resistors, sources and layers. SI throughout.
 
     n live states, one for each capacitor of the tree; n_s sources, voltage sources first.
@@ -80,9 +80,6 @@ class Network:
     stack: Stack | None = None
     # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
     kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "kept": {}}
 
     @property
     def drives(self) -> tuple[tuple[Element, float], ...]:
@@ -295,7 +292,7 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
 
     def make() -> Network:
         if statespace.loop_of(circuit) is None:
-            network = shared(circuit, "network", lambda: build_network(circuit))
+            network = shared(circuit, ("network",), lambda: build_network(circuit))
             now = {e.name: e for e in circuit.elements}
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
         stack = build_stack(circuit, skin_at)

@@ -24,12 +24,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import ComplexArray, FloatArray
+from fingerspice.base.arrays import ComplexArray, FloatArray, Remembering, T
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.circuit import Circuit, Element, T
+from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, SKIN_LADDER, skin_permittivity, skin_resistivity
-from fingerspice.waveforms.waveform import DC, Product, Sum, Waveform, refuse
+from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, refuse
 
 #: Largest number of elements of a circuit, because every matrix of a network is dense.
 MAX_ELEMENTS = 2000
@@ -67,7 +67,7 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
         refuse(still, f"the circuit has no source; allowed: {allowed} or .ic v(node)=")
         # In place of a source, one of 0 A.
         nodes, names = branches[0].nodes[1::-1], branches[0].node_names[1::-1]
-        branches.append(Element("none", "I", nodes, names, MappingProxyType({}), DC(0.0)))
+        branches.append(Element("none", "I", nodes, names, MappingProxyType({}), OFF))
     _refuse_unsolvable(branches)
     return areas, branches
 
@@ -80,20 +80,22 @@ def driving(circuit: Circuit) -> list[Element]:
 
 def driving_sources(circuit: Circuit) -> list[Element]:
     """As `driving`, of a circuit that `find_branches` does not refuse."""
-    if "solvable" not in circuit.related:
-        find_branches(circuit)
-        circuit.related["solvable"] = True
+    loop_of(circuit)
     return driving(circuit)
 
 
-def shared(circuit: Circuit, key: Any, make: Callable[[], T]) -> T:
+def shared(circuit: Circuit, key: tuple[Any, ...], make: Callable[[], T]) -> T:
     """The result of `make`, kept for all related circuits that differ in the sources that carry current only."""
-    drives = {e.name for e in driving(circuit)}
-    passive = [e for e in circuit.elements if e.name not in drives]
-    before, found = circuit.related.get(key, (None, None))
-    if before is None or not all(map(operator.is_, before, passive)):
-        circuit.related[key] = passive, (found := make())
-    return found  # type: ignore[no-any-return]
+
+    def find() -> Remembering:
+        drives = {e.name for e in driving(circuit)}
+        passive = [e for e in circuit.elements if e.name not in drives]
+        before, kept = circuit.related.get("passive", ([], Remembering()))
+        if not before or not all(map(operator.is_, before, passive)):
+            circuit.related["passive"] = passive, (kept := Remembering())
+        return kept  # type: ignore[no-any-return]
+
+    return circuit.remember(("passive",), find).remember(key, make)
 
 
 def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
@@ -108,13 +110,13 @@ def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
         walked: tuple[Hop, ...] | None = circuit.related["hops"]
         if walked is None:
             return None
-        (area,) = _areas(circuit)
+        (area,) = shared(circuit, ("areas",), lambda: _areas(circuit))
         if area.gap is not None and area.gap.values["tau"] > 0.0 and area.given is None:
             return None
         now = {e.name: e for e in circuit.elements}
         return tuple(hop._replace(element=now[hop.element.name]) for hop in walked), area
 
-    return circuit.remember("loop", make)
+    return circuit.remember(("loop",), make)
 
 
 def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
@@ -282,7 +284,7 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
 
 
 @dataclass(frozen=True)
-class Stack:
+class Stack(Remembering):
     """Layers in one series loop with an ideal source, sharing one area, each of one or several cells. SI throughout."""
 
     layers: tuple[Element, ...]  # In loop order, from the source's positive side
@@ -329,9 +331,9 @@ class Stack:
     def waveform(self) -> Waveform:
         """Voltage around the loop: the sum of the sources with their signs."""
         # A source of 0 V only serves to measure a current.
-        waves = [(e.waveform, sign) for e, sign in self.sources if e.waveform not in (None, DC(0.0))]
+        waves = [(e.waveform, sign) for e, sign in self.sources if e.waveform not in (None, OFF)]
         parts = tuple(wave if sign > 0 else Product((DC(-1.0), wave)) for wave, sign in waves if wave is not None)
-        return Sum(parts) if len(parts) > 1 else parts[0] if parts else DC(0.0)
+        return Sum(parts) if len(parts) > 1 else parts[0] if parts else OFF
 
     @property
     def state_order(self) -> tuple[int, ...]:
@@ -411,7 +413,7 @@ def contact_of(gap: Element) -> Contact:
         what = f"{gap.name} has a contact whose constants are beyond the range of numbers"
         raise InputError(f"{what}; allowed: fn, alpha, m_exp, beta, n_exp nearer to Table 1's", gap.where)
 
-    return gap.remember("contact", make)
+    return gap.remember(("contact",), make)
 
 
 def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:

@@ -331,7 +331,7 @@ class Asked:
                 setattr(self, name, _read(name, given.get(name)))
         base = own if own is not None and self.deck == own.text else _parsed(self.deck)
         if self.skin == "dispersive":
-            base = base.remember("dispersive", partial(_dispersive, base))
+            base = base.remember(("dispersive",), partial(_dispersive, base))
         count = f"{count_of(base):,} elements, a dispersive skin counted as its {SLABS} slabs"
         few = base is own or count_of(base) <= MOST_ELEMENTS
         refuse(not few, f"the deck has {count}; allowed: at most {MOST_ELEMENTS} on this page")

@@ -109,14 +109,12 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     named = isinstance(others, Mapping)
     every = [solution, *(others.values() if named else others if isinstance(others, Sequence) else [others])]
     for other in every:
-        require(isinstance(other, Solution), "others", repr(other), "Solutions, or a mapping of names to Solutions")
+        if not isinstance(other, Solution):
+            raise InputError(f"others is {other!r}; allowed: Solutions, or a mapping of names to Solutions")
     if len(every) == 1:
         return [(solution, "")]
-    facts = [
-        (s.circuit.title, changes_text(s.circuit), f"{s.charge_law} law", f"area {s.area_mode}", s.method,
-         f"rtol {s.rtol:g}")
-        for s in every
-    ]  # fmt: skip
+    words = [(f"{s.charge_law} law", f"area {s.area_mode}", s.method, f"rtol {s.rtol:g}") for s in every]
+    facts = [(s.circuit.title, changes_text(s.circuit), *said) for s, said in zip(every, words, strict=True)]
     told = [i for i in range(len(facts[0])) if len({fact[i] for fact in facts}) > 1]
     labels = [", ".join(fact[i] or "the deck as it is" for i in told) or f"run {n}" for n, fact in enumerate(facts, 1)]
     if named:

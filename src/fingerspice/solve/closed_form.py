@@ -29,7 +29,6 @@ from fingerspice.results.outcome import State, Status
 from fingerspice.solve.collocation import solve as solve_by_steps
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, values_at
 from fingerspice.solve.runs import PAST_FOLD, Run, closed_form, gap_signals
-from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.starting import as_shown, from_loop, model_of, to_loop
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import breakpoints_at, on_grid, same_time
@@ -52,7 +51,7 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     at_once, charge_error = scene.network.stack is not None and area is None, None
     area = scene.net.area0 if area is None else area
     tables = Tables(problem, 1e-12 if at_once else 1e-13, no_chirps=not at_once)
-    modes = kept_with(scene.prepared, ("modes", *area.tolist()), MOST_MODES, lambda: scene.modes_at(area))
+    modes = scene.remember(("modes", *area.tolist()), lambda: scene.modes_at(area), MOST_MODES)
     n = modes.rates.size
     v0, z_end = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before), start.y[n:]
     sampled = _at_samples(problem, modes, v0)

@@ -34,7 +34,7 @@ from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import sided
 from fingerspice.solve.problem import ROUNDING, Problem, Tables, values_at
 from fingerspice.solve.runs import Progress, Run, excess_of, integrate
-from fingerspice.solve.scenes import Scene, kept_with
+from fingerspice.solve.scenes import Scene
 from fingerspice.solve.starting import as_shown, from_loop, model_of, to_loop
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
 
@@ -113,7 +113,7 @@ class Track(Stepping):
             return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
 
         # Similar runs share a system: there is one for each decade of tolerances.
-        self.system, self.area_error = kept_with(scene.prepared, ("system", decade, top), MOST_SYSTEMS, make)
+        self.system, self.area_error = scene.remember(("system", decade, top), make, MOST_SYSTEMS)
         model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
         # Of the layer through which the charge is computed.
@@ -231,7 +231,7 @@ class Known:
     @staticmethod
     def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
         key = ("referred", scene.fixed, area.tobytes())
-        return kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
+        return scene.network.remember(key, lambda: _refer(scene, area), MOST_KEPT)
 
     def form(self) -> Form:
         """A form for the areas at 0 V, with its own copy of the numbers: compiled code overwrites them."""
@@ -246,8 +246,8 @@ def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
     # Each thread has its own set, because compiled code writes into the tables.
     key = ("references", decade, threading.get_ident())
     if anew:
-        scene.prepared.pop(key, None)
-    return kept_with(scene.prepared, key, MOST_SETS, lambda: Known(scene, decade))
+        scene.kept.pop(key, None)
+    return scene.remember(key, lambda: Known(scene, decade), MOST_SETS)
 
 
 def _fed(scene: Scene) -> IntArray:

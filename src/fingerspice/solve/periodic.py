@@ -26,10 +26,9 @@ from fingerspice.solve.collocation import GUESS, March, Track, stepping
 from fingerspice.solve.nodal import pass_through
 from fingerspice.solve.problem import Problem, joined
 from fingerspice.solve.runs import no_period
-from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
 from fingerspice.waveforms.sampling import source_table
-from fingerspice.waveforms.waveform import DC
+from fingerspice.waveforms.waveform import OFF
 
 # Number of equidistant times of a period from which the mean of an area with a time constant is computed.
 SAMPLES = 64
@@ -84,9 +83,9 @@ class Period:
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
         key, end = ("period", self.begin, self.span, problem.step if scene.is_sampled else 0.0), self.begin + self.span
-        self.tables = kept_with(scene.prepared, key, MOST_PERIODS, lambda: [
+        self.tables = scene.remember(key, lambda: [
             source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.network.waveforms
-        ])  # fmt: skip
+        ], MOST_PERIODS)  # fmt: skip
         broken = [table.not_finite for table in self.tables if table.not_finite is not None]
         if broken:
             raise no_period(problem, Status.SOURCE_NOT_FINITE, min(broken))
@@ -165,7 +164,7 @@ def _turns(problem: Problem) -> bool:
     """
     period = problem.network.waveform.period
     for wave in problem.network.waveforms:
-        if wave == DC(0.0):
+        if wave == OFF:
             continue
         if not wave.half_wave or wave.period is None or period is None:
             return False

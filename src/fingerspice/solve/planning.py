@@ -22,7 +22,6 @@ from fingerspice.results.record import Record
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare, shortest_event, to_ends
 from fingerspice.solve.runs import Run
-from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DOUBLE, refuse, require
@@ -61,7 +60,7 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
     refuse(tier not in ("auto", *TIERS), f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
     asked = "coupled" if tier == "auto" and method != "auto" else tier
     key = ("plan", rtol, asked, problem.start, problem.charge, _stores(problem), problem.t_start, problem.t_stop)
-    return kept_with(problem.scene.prepared, key, MOST_PLANS, lambda: _plan(problem, rtol, asked))
+    return problem.scene.remember(key, lambda: _plan(problem, rtol, asked), MOST_PLANS)
 
 
 def _plan(problem: Problem, rtol: float, tier: str) -> Plan:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_number
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, Remembering, real_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import area_given, time_slip
@@ -22,11 +22,11 @@ from fingerspice.circuit.network import Network
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
-from fingerspice.solve.scenes import Scene, kept_with, scene_of
+from fingerspice.solve.scenes import Scene, scene_of
 from fingerspice.solve.starting import initial_state, to_loop
 from fingerspice.waveforms import sampling
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, is_sampled, same_time, source_table
+from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, same_time, source_table
 from fingerspice.waveforms.waveform import DC, Waveform, require
 
 #: Most periods (or shortest time scales) of the source in a run, and most breakpoints: they take hours and a gigabyte.
@@ -100,10 +100,10 @@ class Problem:
 
     def kept(self, what: str, make: Callable[[], FloatArray], *how: Any) -> FloatArray:
         """Times that follow from the sources and the run; the waveform caches them if they are few."""
-        kept, key = self.network.waveform.kept, (what, self.t_start, self.t_stop, *how)
-        found = kept_with(kept, key, 1, make)
+        wave, key = self.network.waveform, (what, self.t_start, self.t_stop, *how)
+        found = wave.remember(key, make, 1)
         if found.size > KEPT:
-            kept.pop(key, None)
+            wave.kept.pop(key, None)
         return found
 
     @property
@@ -146,7 +146,7 @@ def prepare(
         first, last = float(t_eval[0]), float(t_eval[-1])
         allowed = f"times from {t_start:g} s to t_stop = {stop:g} s{time_slip(first, last, stop)}"
         require(first >= t_start and last <= stop, "t_eval", f"{first:g} s to {last:g} s", allowed)
-    end = kept_with(wave.kept, ("end", stop), 1, lambda: sampling.on_breakpoint(wave, stop))
+    end = wave.remember(("end", stop), lambda: sampling.on_breakpoint(wave, stop), 1)
     return Problem(
         circuit, scene, t_start, end, t_start + (tran.start if tran else 0.0),
         tran.step if tran else (stop - t_start) / 1000.0,
@@ -177,10 +177,12 @@ def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
 
 def check_outputs(circuit: Circuit, count: float) -> None:
     """Refuse a number of output times for whose signals memory is too small."""
-    of_device = {"GAP": 7, "V": 3, "I": 3}
-    signals = sum(of_device.get(element.device, 0) + element.spec.is_layer for element in circuit.elements)
-    signals += len({node for element in circuit.elements for node in element.nodes}) + 1
-    size = 8.0 * signals * count
+
+    def counted() -> int:
+        of_device, nodes = {"GAP": 7, "V": 3, "I": 3}, {node for e in circuit.elements for node in e.nodes}
+        return sum(of_device.get(e.device, 0) + e.spec.is_layer for e in circuit.elements) + len(nodes) + 1
+
+    size = 8.0 * (signals := circuit.remember(("signals",), counted)) * count
     told = f"one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB"
     allowed = f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning"
     require(size <= MOST_BYTES, "the run", told, allowed)
@@ -288,8 +290,8 @@ class Tables:
         # rises out of next to nothing would be followed there beyond its own digits.
         peaks = [wave.kept.get("peak", (None, 0.0))[1] for wave in problem.network.waveforms]
         self.scales = [peak if np.isfinite(peak) else 0.0 for peak in peaks]
-        kept: dict[Any, Any] | None = problem.network.waveform.kept if len(self.edges) <= 1 + KEPT_WINDOWS else None
-        self.kept = {} if problem.scene.is_sampled else kept
+        few = problem.network.waveform if len(self.edges) <= 1 + KEPT_WINDOWS else None
+        self.keeper: Remembering | None = Remembering() if problem.scene.is_sampled else few
 
     def __iter__(self) -> Iterator[list[SourceTable]]:
         for w0, w1 in itertools.pairwise(self.edges):
@@ -298,7 +300,7 @@ class Tables:
             # With `no_chirps`, chirps are approximated by series, so that these tables depend on the tolerance.
             key, make = ("tables", w0, w1, self.tol if self.no_chirps else None), partial(self._tables, w0, w1)
             most = max(MOST_KEPT, len(self.edges))
-            tables = make() if self.kept is None else kept_with(self.kept, key, most, make)
+            tables = make() if self.keeper is None else self.keeper.remember(key, make, most)
             self.scales = [max(scale, table.scale) for scale, table in zip(self.scales, tables, strict=True)]
             self.rough = max(self.rough, *(table.rough for table in tables))
             self.not_finite = min((t.not_finite for t in tables if t.not_finite is not None), default=None)
@@ -311,7 +313,7 @@ class Tables:
         make = partial(source_table, no_chirps=self.no_chirps, shortest=shortest_event(problem))
         for place, (wave, scale) in enumerate(zip(problem.network.waveforms, self.scales, strict=True)):
             table = make(wave, w0, w1, self.tol, problem.step, scale=scale)
-            if is_sampled(wave):
+            if wave.is_sampled:
                 off = table.unseen(wave, problem.t_out, self.tol)
                 self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
             tables.append(table)
@@ -360,7 +362,7 @@ def after_the_end(problem: Problem) -> Sources | None:
             return ()
         return (joined([source_table(w, stop, stop + step, 1e-10, step) for w in problem.network.waveforms]),)
 
-    found = kept_with(problem.network.waveform.kept, ("after", stop, step), 1, make)
+    found = problem.network.waveform.remember(("after", stop, step), make, 1)
     return found[0] if found else None
 
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
-from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, T
+from fingerspice.base.arrays import FloatArray, Remembering
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import COUPLING, freezing_error
 from fingerspice.circuit.network import Modes, Network, loop_network, mean_areas, network_modes, network_of
 from fingerspice.circuit.statespace import Stack, build_stack, loop_of
@@ -20,7 +18,6 @@ from fingerspice.engine.one_area.model import Model
 from fingerspice.engine.one_area.system import build_system
 from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import fixed_area_curve
-from fingerspice.waveforms.sampling import is_sampled
 from fingerspice.waveforms.waveform import Waveform, require
 
 # Error allowed for taking a dispersive skin's data at one frequency, relative to the error asked for.
@@ -32,22 +29,8 @@ LEAST_PEAK = 1e-300
 BEYOND_PEAK, DRIVEN_BY_CURRENT, PEAK_UNKNOWN = 1.3, 300.0, 1.0
 
 
-def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], T]) -> T:
-    """The entry of a cache under a key, of which at most `most` share the first part; else all of these make room.
-
-    Other threads may remove entries at any time, so that the entry is looked up only once.
-    """
-    found: T | None = prepared.get(key)
-    if found is None:
-        kept = [name for name in list(prepared) if name[0] == key[0]]
-        for name in kept if len(kept) >= most else ():
-            prepared.pop(name, None)
-        found = prepared[key] = make()
-    return found
-
-
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(Remembering):
     """A circuit under one charge law and area mode, as arrays; the circuit caches it from run to run."""
 
     network: Network  # The circuit's network; for a series stack that of its loop
@@ -61,13 +44,11 @@ class Scene:
     # Frequency (Hz) at which a dispersive skin's data are taken, if one is accurate enough for the error asked for, and
     # the error of the gap voltage of doing so, relative to its peak
     skin: tuple[float, float] | None = None
-    # Cache of the tables and systems that integrators have made for this scene
-    prepared: dict[Any, Any] = field(default_factory=dict)
 
     @cached_property
     def is_sampled(self) -> bool:
         """Whether some source is a user's function, which has to be sampled, not a waveform with a formula."""
-        return any(is_sampled(w) for w in self.network.waveforms)
+        return any(w.is_sampled for w in self.network.waveforms)
 
     @cached_property
     def coupled(self) -> bool:
@@ -106,8 +87,7 @@ class Scene:
         stack = self.network.stack
         if stack is None or (whole := stack.by_layer) is stack:
             return self
-        made = partial(replace, self, network=loop_network(whole), prepared={})
-        return kept_with(self.prepared, ("shown",), 1, made)
+        return self.remember(("shown",), lambda: replace(self, network=loop_network(whole)))
 
     @cached_property
     def modes(self) -> Modes:
@@ -237,4 +217,4 @@ def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
             area0=area0, tau=1.0 / fastest if fastest > 0.0 else math.inf, curve=curve,
         )  # fmt: skip
 
-    return kept_with(stack.kept, ("model", law, fixed), 2, make)._replace(curve=curve)
+    return stack.remember(("model", law, fixed), make, 2)._replace(curve=curve)

@@ -34,7 +34,7 @@ from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
-from fingerspice.solve.scenes import Scene, kept_with
+from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.waveform import DC, require
 
 
@@ -117,7 +117,7 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
                     area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
         return _state(scene, u, area, None)
 
-    return kept_with(scene.prepared, ("initial", start), 3, make)
+    return scene.remember(("initial", start), make, 3)
 
 
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:

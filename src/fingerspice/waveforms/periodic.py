@@ -436,6 +436,10 @@ class _Stretches(Waveform):
         return out
 
     @property
+    def is_sampled(self) -> bool:
+        return self.waveform.is_sampled
+
+    @property
     def precision(self) -> float:  # type: ignore[override]
         return self.waveform.precision
 

@@ -22,7 +22,7 @@ from fingerspice.base.compiled import jit
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.engine.collocation.readout import SAME_TIME
 from fingerspice.numerics import chebyshev
-from fingerspice.waveforms.periodic import Ramps, in_windows, runs_through
+from fingerspice.waveforms.periodic import in_windows, runs_through
 from fingerspice.waveforms.waveform import DOUBLE, Waveform, refuse, require
 
 _PERIODS_PER_SEGMENT = 64.0  #: Longest segment of an oscillation: a phase's rounding error grows with it.
@@ -170,15 +170,6 @@ def on_breakpoint(waveform: Waveform, t: float) -> float:
     """The breakpoint that differs from `t` (s) only by rounding, else `t`; so a run of three periods ends at a jump."""
     near = breakpoints_at(waveform, t)
     return float(near[0]) if near.size else t
-
-
-def is_sampled(waveform: Waveform) -> bool:
-    """Whether a waveform has no terms and is therefore represented by Chebyshev series."""
-    if isinstance(waveform, Ramps):
-        return False
-    if "sampled" not in waveform.kept:
-        waveform.kept["sampled"] = waveform.terms(np.zeros(1), np.ones(1)) is None
-    return bool(waveform.kept["sampled"])
 
 
 def source_table(

@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, real_number, real_numbers
+from fingerspice.base.arrays import FloatArray, Remembering, real_number, real_numbers
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import UNITS, Degree, Hertz, PerSecond, Ratio, Second, Volt
 
@@ -46,7 +46,7 @@ class Fundamental:
     phase: float  # rad
 
 
-class Waveform:
+class Waveform(Remembering):
     """A voltage against time, defined for all times.
 
     Subclasses implement `value`, `breakpoints` and, where the waveform has that form, `terms`; periodic ones also
@@ -70,26 +70,19 @@ class Waveform:
     def __post_init__(self) -> None:
         """Make doubles of the fields that have a unit, and refuse what is no number of it."""
         for name, unit in self.units.items():
+            value, (largest, smallest) = getattr(self, name), RANGES.get(unit, ANY_RANGE)
+            if type(value) is float and (value == 0.0 or smallest <= abs(value) <= largest):
+                continue
             what = f"{type(self).__name__} {name}"
-            value = real_number(what, getattr(self, name), f"a number of {unit}" if unit else "a number")
+            value = real_number(what, value, f"a number of {unit}" if unit else "a number")
             fine = math.isfinite(value) or (value == math.inf and name in self._endless)
             require(fine, what, value, "a finite number")
-            largest, smallest = RANGES.get(unit, ANY_RANGE)
             if value != 0.0 and not smallest <= abs(value) <= largest:
                 check_range(what, value, unit)
             self._declare(**{name: value})
 
     def _declare(self, **facts: Any) -> None:
         self.__dict__.update(facts)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but what is computed when it is first asked for."""
-        return {k: v for k, v in vars(self).items() if not isinstance(getattr(type(self), k, None), cached_property)}
-
-    @cached_property
-    def kept(self) -> dict[Any, Any]:
-        """Cache of results about this waveform, shared by all circuits that use it."""
-        return {}
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         """Voltage (V) at times `t` (s); at a jump the limit from the right or from the left, as `side` says."""
@@ -123,6 +116,11 @@ class Waveform:
             such form.
         """
         return None
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether it has no terms and is therefore represented by Chebyshev series."""
+        return type(self).terms is Waveform.terms
 
     def tone(self) -> float | None:
         """Frequency (Hz) of the fundamental, or None."""
@@ -259,6 +257,9 @@ class DC(Waveform):
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         return terms_of(start.size, (self.level,))
+
+
+OFF = DC(0.0)  #: A source that is switched off, or that only serves to measure a current
 
 
 @dataclass(frozen=True)
@@ -444,6 +445,10 @@ class _Combination(Waveform):
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
         blocks = [part.terms(start, stop) for part in self.parts]
         return None if any(block is None for block in blocks) else reduce(self._joined_terms, blocks)
+
+    @property
+    def is_sampled(self) -> bool:
+        return any(part.is_sampled for part in self.parts)
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         return np.unique(np.concatenate([part.breakpoints(t0, t1) for part in self.parts]))

@@ -25,7 +25,6 @@ from fingerspice.engine.lanes.loops import MORE, hand_on, lead, show, span
 from fingerspice.engine.lanes.rows import along, rows_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.form import PIECES, LaneForm, finger, rounded_peak, stack
-from fingerspice.solve.scenes import kept_with
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.samples import MOST_PER_POINT, Samples, as_samples
 from fingerspice.waveforms.waveform import DC
@@ -376,16 +375,16 @@ def ready(problem: Problem, rtol: float) -> LaneForm | None:
     key: tuple[Any, ...] = "followed", decade, problem.charge, threading.get_ident()
     if scene.network.stack is not None:
         key = *key, scene.charge_law, rounded_peak(scene.u_peak)
-        return kept_with(scene.network.stack.kept, key, MOST_FORMS, lambda: stack(problem, decade))
+        return scene.network.stack.remember(key, lambda: stack(problem, decade), MOST_FORMS)
     source, wave = driving(problem)
     assert isinstance(wave, Samples)
-    return kept_with(scene.prepared, key, MOST_FORMS, partial(finger, problem, decade, source, wave))
+    return scene.remember(key, partial(finger, problem, decade, source, wave), MOST_FORMS)
 
 
 def _points(problem: Problem, wave: PWL) -> FloatArray:
     """Times (s) of a run's points and ends, and more on long lines, kept for the last run; empty if not dense."""
     t0, t1 = problem.t_start, problem.t_stop
-    return kept_with(wave.kept, ("points", t0, t1), 1, lambda: _dense(wave.knots[0], t0, t1))
+    return wave.remember(("points", t0, t1), lambda: _dense(wave.knots[0], t0, t1), 1)
 
 
 def _dense(t: FloatArray, t0: float, t1: float) -> FloatArray:

@@ -130,7 +130,7 @@ def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dic
     """Values by path, all of one shape (n_scene,); refused where a path is unknown or a value NaN or out of range."""
     given: dict[str, FloatArray] = {}
     good = isinstance(parameters, Mapping) and bool(parameters)
-    require(good, "parameters", repr(parameters), "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
+    require(good, "parameters", parameters, "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
     for path, values in parameters.items():
         name = own_path(circuit, path)
         array = real_numbers(path, values, "an array of numbers")

@@ -25,7 +25,7 @@ from fingerspice.physics.contact import universal_curve_array
 from fingerspice.physics.materials import EPS0
 from fingerspice.waveforms.periodic import Pulse, Square
 from fingerspice.waveforms.samples import Samples, as_samples
-from fingerspice.waveforms.waveform import AM, DC, Sine
+from fingerspice.waveforms.waveform import AM, OFF, Sine
 
 if TYPE_CHECKING:
     from fingerspice.studies.batch.batch import Task
@@ -116,7 +116,7 @@ def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str
         return f"the stack has other layers than {', '.join(_LAYERS)}, or not 2 to {_MOST_LAYERS} of them"
     if (circuit.charge_law or "local") != "local" or circuit.work != "gap":
         return "the charge law is mobile, or the total voltage is held"
-    sources = tuple((e, float(turn * stack.sign[stack.gap])) for e, turn in stack.sources if e.waveform != DC(0.0))
+    sources = tuple((e, float(turn * stack.sign[stack.gap])) for e, turn in stack.sources if e.waveform != OFF)
     waves = [e.waveform for e, _ in sources]
     recording = as_samples(waves[0]) if len(waves) == 1 and waves[0] is not None else None
     jumping = recording is None and any(isinstance(wave, Square | Pulse) for wave in waves)

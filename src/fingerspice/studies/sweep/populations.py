@@ -48,7 +48,7 @@ class Plan:
         """Of what `sweep` is asked for as its `parameters`, with `most` draws or fewer."""
         require_circuit(circuit)
         good = isinstance(asked, Mapping) and bool(asked)
-        require(good, "parameters", repr(asked), "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
+        require(good, "parameters", asked, "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
         self.n, self.seed = n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
         # Draws of a part, and by each bit of its number what that adds to their bits
         self.count, self._steps = n, list[NDArray[np.int64]]()
