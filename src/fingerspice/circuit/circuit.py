@@ -139,7 +139,7 @@ class Circuit(Remembering, Shown):
         Changes made by `replace`, from path to value as text.
     sets : mapping of str to mapping
         Named sets of parameters that were applied, each with the values that it gave, by path.
-    related : dict
+    related : Remembering
         Cache of results that depend on nodes and devices alone, shared by all circuits that `replace` derives.
     """
 
@@ -156,10 +156,7 @@ class Circuit(Remembering, Shown):
     path: Path | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    related: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "related": {}}
+    related: Remembering = field(default_factory=Remembering, init=False, repr=False, compare=False)
 
     def _page(self) -> Page:
         from fingerspice.circuit.describe import circuit_page

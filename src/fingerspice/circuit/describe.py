@@ -409,9 +409,8 @@ def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | 
     last = min(wave.count, math.floor((t_stop - wave.start) * wave.rate) + 1) if isinstance(wave, Samples) else 0
     if not isinstance(wave, Samples) or last < _FEW:
         return None
-    # End and spectrum are one entry, because another thread may replace it at any time.
-    end, frequencies, total = wave.kept.get("spectrum", (None, None, None))
-    if end != t_stop:
+
+    def make() -> tuple[FloatArray, FloatArray]:
         # A power of two, as the Fourier transform of a number with a large prime factor takes many times as long.
         count = min(2 ** int(math.log2(last)), 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
         starts = np.unique(np.linspace(0, last - count, min(_PIECES, math.ceil(last / count))).astype(int))
@@ -420,9 +419,9 @@ def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | 
             lines = np.fft.rfft(wave.between(i, i + count) * window)
             total += lines.real**2 + lines.imag**2
         total[1:] *= 2.0
-        frequencies = np.arange(total.size) * (wave.rate / count)
-        wave.kept["spectrum"] = t_stop, frequencies, total
-    return frequencies, total
+        return np.arange(total.size) * (wave.rate / count), total
+
+    return wave.remember(("spectrum", t_stop), make, 1)
 
 
 def energy_outside(waveform: Waveform, t_stop: float, band: tuple[float, float] = SKIN_BAND) -> tuple[float, float]:
@@ -485,9 +484,7 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> Ite
     skins = circuit.by_device("SKIN_DISPERSIVE")
     if not skins or not 0.0 < t_stop < math.inf:
         return
-    end, shares = waveform.kept.get("outside", (None, ()))
-    if end != t_stop:
-        _, shares = waveform.kept["outside"] = t_stop, energy_outside(waveform, t_stop)
+    shares = waveform.remember(("outside", t_stop), lambda: energy_outside(waveform, t_stop), 1)
     ends = f"below {SKIN_BAND[0]:g} Hz", f"above {SKIN_BAND[1] / 1e3:g} kHz"
     found = [(share, where) for share, where in zip(shares, ends, strict=True) if share > NOTABLE]
     parts = " and ".join(f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}" for share, where in found)

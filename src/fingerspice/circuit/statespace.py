@@ -90,9 +90,9 @@ def shared(circuit: Circuit, key: tuple[Any, ...], make: Callable[[], T]) -> T:
     def find() -> Remembering:
         drives = {e.name for e in driving(circuit)}
         passive = [e for e in circuit.elements if e.name not in drives]
-        before, kept = circuit.related.get("passive", ([], Remembering()))
+        before, kept = circuit.related.kept.get("passive", ([], Remembering()))
         if not before or not all(map(operator.is_, before, passive)):
-            circuit.related["passive"] = passive, (kept := Remembering())
+            circuit.related.kept["passive"] = passive, (kept := Remembering())
         return kept  # type: ignore[no-any-return]
 
     return circuit.remember(("passive",), find).remember(key, make)
@@ -105,9 +105,7 @@ def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
     """
 
     def make() -> tuple[tuple[Hop, ...], Area] | None:
-        if "hops" not in circuit.related:
-            circuit.related["hops"] = _find_hops(circuit)
-        walked: tuple[Hop, ...] | None = circuit.related["hops"]
+        walked = circuit.related.remember(("hops",), lambda: _find_hops(circuit))
         if walked is None:
             return None
         (area,) = shared(circuit, ("areas",), lambda: _areas(circuit))

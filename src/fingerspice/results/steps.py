@@ -8,14 +8,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, Remembering
 from fingerspice.engine.collocation.readout import RECORDED, Steps, new_steps
 from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS, TO_SERIES
@@ -70,7 +70,7 @@ class Recorder:
 
 
 @dataclass(frozen=True)
-class Recorded:
+class Recorded(Remembering):
     """Consecutive steps of a run since a time (s), with its signals at any fraction of each step."""
 
     # (6, k): Start of each step, its length, the end reached (s), the part of the length that was reached, the number
@@ -79,8 +79,6 @@ class Recorded:
     values: FloatArray  # (k, n_column, NODES): At the nodes of the whole step, which may extend beyond the end reached
     first: float
     make: Make
-    # Records at places that were asked for, as signals are mostly asked for at the same places one after another
-    _known: dict[object, tuple[FloatArray, Signals]] = field(default_factory=dict, repr=False, compare=False)
 
     def run(self, names: Sequence[str], since: float, until: float) -> Recorded | None:
         """These steps; None where they begin after `since` (s)."""
@@ -143,14 +141,13 @@ class Recorded:
         index, (low, high) = panels[0].astype(int), panels[1:3, :, None]
         # Written so that the places 0 and 1 give exactly `low` and `high`.
         fraction = low * (1.0 - places) + high * places
-        key = index.tobytes(), fraction.tobytes()
-        if (found := self._known.get(key)) is None:
-            found = self._record(index, fraction, np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction)))
-            if fraction.size <= _MOST_KNOWN:
-                while len(self._known) >= _KNOWN:
-                    self._known.pop(next(iter(self._known)), None)
-                self._known[key] = found
-        t, record = found
+
+        def make() -> tuple[FloatArray, Signals]:
+            return self._record(index, fraction, np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction)))
+
+        # Signals are mostly asked for at the same places one after another.
+        key = "places", index.tobytes(), fraction.tobytes()
+        t, record = self.remember(key, make, _KNOWN) if fraction.size <= _MOST_KNOWN else make()
         return t, record.one(name).reshape(t.shape)
 
 

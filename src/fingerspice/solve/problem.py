@@ -357,13 +357,12 @@ def after_the_end(problem: Problem) -> Sources | None:
     """The sources from the end of a run on, where one of them may jump there; else None."""
     stop, step = problem.t_stop, problem.step
 
-    def make() -> tuple[Sources, ...]:
+    def make() -> Sources | None:
         if not any(breakpoints_at(wave, stop).size for wave in problem.network.waveforms):
-            return ()
-        return (joined([source_table(w, stop, stop + step, 1e-10, step) for w in problem.network.waveforms]),)
+            return None
+        return joined([source_table(w, stop, stop + step, 1e-10, step) for w in problem.network.waveforms])
 
-    found = problem.network.waveform.remember(("after", stop, step), make, 1)
-    return found[0] if found else None
+    return problem.network.waveform.remember(("after", stop, step), make, 1)
 
 
 def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) -> IntArray:

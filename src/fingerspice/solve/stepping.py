@@ -44,6 +44,8 @@ FINEST = 4e-15
 FINER = 0.01
 # Longest step, relative to the source's shortest time scale: the collocation nodes must not alias the source.
 LONGEST_STEP = 0.6
+# Parts of a run under a chirp, in each of which the longest step is that of the highest frequency there.
+PARTS = 8
 # Most steps of a period that is kept for repetition: 1 MB.
 KEPT_STEPS = 2000
 
@@ -72,9 +74,11 @@ class Stepping(Integration):
         self.control = self.controls[0]
         self.control["t"] = problem.t_start
         super().__init__(problem)
-        span, self.period = problem.t_stop - problem.t_start, problem.network.waveform.period or math.inf
-        longest = min(LONGEST_STEP * problem.network.waveform.shortest_time(), span, problem.max_step)
-        self.pace = Pace(tol, longest, True, problem.charge)
+        self.wave, span = problem.network.waveform, problem.t_stop - problem.t_start
+        self.period, self.longest = self.wave.period or math.inf, min(span, problem.max_step)
+        ends = (self.wave.shortest_time(t, t) for t in (problem.t_start, problem.t_stop))
+        self.part = math.inf if len({*ends}) == 1 else span / PARTS
+        self.pace = Pace(tol, self.longest, True, problem.charge)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.step = np.zeros(1, readout.STEP)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
@@ -188,7 +192,10 @@ class Stepping(Integration):
     def through(self, sources: Sources, t_end: float) -> Status:
         # A period that has been repeated may have led there already.
         while self.t < t_end:
-            code = self.march(sources, t_end, self.looks)
+            until = t_end if t_end - self.t < 1.5 * self.part else self.t + self.part
+            longest = min(self.longest, LONGEST_STEP * self.wave.shortest_time(self.t, until))
+            self.pace = self.pace._replace(h_max=longest)
+            code = self.march(sources, until, self.looks)
             if code == readout.LOOKED_AT:
                 self._settle()
             elif code == readout.EXCESSIVE:

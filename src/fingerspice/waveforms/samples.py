@@ -276,11 +276,9 @@ def as_samples(wave: Waveform) -> Samples | None:
     """
     if isinstance(wave, Samples):
         return wave
-    if "samples" not in wave.kept:
-        of_parts = _of_parts(wave) if isinstance(wave, Sum | Product) else None
-        wave.kept["samples"] = _of_points(wave) if isinstance(wave, PWL) else of_parts
-    found: Samples | None = wave.kept["samples"]
-    return found
+    if isinstance(wave, PWL):
+        return wave.remember(("samples",), lambda: _of_points(wave))
+    return wave.remember(("samples",), lambda: _of_parts(wave)) if isinstance(wave, Sum | Product) else None
 
 
 def _of_parts(wave: Sum | Product) -> Samples | None:

@@ -126,8 +126,8 @@ class Waveform(Remembering):
         """Frequency (Hz) of the fundamental, or None."""
         return 1.0 / self.period if self.period else None
 
-    def shortest_time(self) -> float:
-        """Shortest time scale (s) on which the waveform varies between breakpoints; inf for constants and ramps."""
+    def shortest_time(self, start: float = -math.inf, stop: float = math.inf) -> float:
+        """Shortest time scale (s) of the waveform between breakpoints of an interval; inf for constants and ramps."""
         return self._quick
 
     def breakpoint_rate(self) -> float:
@@ -364,7 +364,11 @@ class Chirp(Waveform):
         super().__post_init__()
         require(self.f0 > 0.0 and self.f1 > 0.0, "chirp frequencies", f"{self.f0:g}, {self.f1:g} Hz", "> 0")
         require(self.duration > 0.0, "chirp duration", f"{self.duration:g} s", "> 0")
-        self._declare(_breaks=(0.0, self.duration), _quick=1.0 / max(self.f0, self.f1))
+        self._declare(_breaks=(0.0, self.duration))
+
+    def shortest_time(self, start: float = -math.inf, stop: float = math.inf) -> float:
+        ends = (min(max(t / self.duration, 0.0), 1.0) for t in (start, stop))
+        return 1.0 / max(self.f0 + (self.f1 - self.f0) * part for part in ends)
 
     def _phase(self, t: FloatArray) -> FloatArray:
         sweep = np.clip(t, 0.0, self.duration)
@@ -430,11 +434,14 @@ class _Combination(Waveform):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        rate = sum(1.0 / part.shortest_time() for part in self.parts)
-        quick, settled = 1.0 / rate if rate else math.inf, max(part.settled for part in self.parts)
+        settled = max(part.settled for part in self.parts)
         first, last = zip(*(part.course for part in self.parts), strict=True)
         course, period = (min(first), max(last)), _common_period(self.parts)
-        self._declare(period=period, settled=settled, course=course, _quick=quick)
+        self._declare(period=period, settled=settled, course=course)
+
+    def shortest_time(self, start: float = -math.inf, stop: float = math.inf) -> float:
+        rate = sum(1.0 / part.shortest_time(start, stop) for part in self.parts)
+        return 1.0 / rate if rate else math.inf
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.asarray(self._joined(part.value(t, side) for part in self.parts))
