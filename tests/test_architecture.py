@@ -19,12 +19,12 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along.
-ALL_LINES = 35_994
+ALL_LINES = 35_983
 ALL_FILES = 129
 PACKAGE_LINES = {
-    "base": 1_035, "circuit": 2_019, "cli": 1_471, "engine": 7_896, "explorer": 1_230, "netlist": 2_072,
-    "numerics": 1_166, "physics": 453, "plots": 1_223, "results": 2_508, "sets": 365, "solve": 5_691,
-    "studies": 6_067, "torch": 387, "waveforms": 2_262,
+    "base": 1_035, "circuit": 2_011, "cli": 1_471, "engine": 7_896, "explorer": 1_230, "netlist": 2_072,
+    "numerics": 1_166, "physics": 453, "plots": 1_223, "results": 2_505, "sets": 365, "solve": 5_697,
+    "studies": 6_067, "torch": 387, "waveforms": 2_256,
 }  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.

@@ -140,7 +140,7 @@ def pass_through(
 
 def _schemes(problem: Problem) -> tuple[Scheme, Scheme]:
     """The coarser run's method and the run's."""
-    longest = min(LONGEST_STEP * problem.network.waveform.shortest_time(), problem.max_step)
+    longest = problem.longest_step(LONGEST_STEP, problem.t_start, problem.t_stop)
     return radau_scheme(STAGES_BESIDE)._replace(h_max=longest), radau_scheme(STAGES)._replace(h_max=longest)
 
 

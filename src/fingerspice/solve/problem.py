@@ -106,11 +106,11 @@ class Problem:
             wave.kept.pop(key, None)
         return found
 
-    @property
-    def max_step(self) -> float:
-        """Longest step (s) that the deck's .tran line allows."""
-        tran = self.circuit.tran
-        return math.inf if tran is None or tran.max_step is None else tran.max_step
+    def longest_step(self, share: float, start: float, stop: float) -> float:
+        """Longest step (s) between two times (s): a share of the shortest time there, and what the deck allows."""
+        tran, shortest = self.circuit.tran, self.network.waveform.shortest_time(start, stop)
+        most = math.inf if tran is None or tran.max_step is None else tran.max_step
+        return min(share * shortest, self.t_stop - self.t_start, most)
 
 
 def prepare(

@@ -74,11 +74,11 @@ class Stepping(Integration):
         self.control = self.controls[0]
         self.control["t"] = problem.t_start
         super().__init__(problem)
-        self.wave, span = problem.network.waveform, problem.t_stop - problem.t_start
-        self.period, self.longest = self.wave.period or math.inf, min(span, problem.max_step)
-        ends = (self.wave.shortest_time(t, t) for t in (problem.t_start, problem.t_stop))
-        self.part = math.inf if len({*ends}) == 1 else span / PARTS
-        self.pace = Pace(tol, self.longest, True, problem.charge)
+        wave, span = problem.network.waveform, problem.t_stop - problem.t_start
+        self.period = wave.period or math.inf
+        self.pace = Pace(tol, problem.longest_step(LONGEST_STEP, problem.t_start, problem.t_stop), True, problem.charge)
+        first, last = (wave.shortest_time(t, t) for t in (problem.t_start, problem.t_stop))
+        self.part = math.inf if first == last else span / PARTS
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.step = np.zeros(1, readout.STEP)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
@@ -193,8 +193,8 @@ class Stepping(Integration):
         # A period that has been repeated may have led there already.
         while self.t < t_end:
             until = t_end if t_end - self.t < 1.5 * self.part else self.t + self.part
-            longest = min(self.longest, LONGEST_STEP * self.wave.shortest_time(self.t, until))
-            self.pace = self.pace._replace(h_max=longest)
+            if self.part < math.inf:
+                self.pace = self.pace._replace(h_max=self.problem.longest_step(LONGEST_STEP, self.t, until))
             code = self.march(sources, until, self.looks)
             if code == readout.LOOKED_AT:
                 self._settle()

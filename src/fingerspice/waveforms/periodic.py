@@ -383,7 +383,7 @@ class _Stretches(Waveform):
 
     def __post_init__(self) -> None:
         wave = as_waveform(self.waveform)
-        self._declare(waveform=wave, _quick=wave.shortest_time())
+        self._declare(waveform=wave, is_sampled=wave.is_sampled, _quick=wave.shortest_time())
         super().__post_init__()
 
     def _begin(self, t: FloatArray) -> FloatArray:
@@ -434,10 +434,6 @@ class _Stretches(Waveform):
         out = np.zeros((start.size, *block.shape[1:]))
         out[on] = block
         return out
-
-    @property
-    def is_sampled(self) -> bool:
-        return self.waveform.is_sampled
 
     @property
     def precision(self) -> float:  # type: ignore[override]

@@ -59,6 +59,7 @@ class Waveform(Remembering):
     settled: float = 0.0  #: Time (s) from which the waveform is periodic
     precision: float = DOUBLE  #: Distance of neighbouring numbers of the kind that the values are computed in
     course: tuple[float, float] = (-math.inf, math.inf)  #: Before and after these times (s) it is constant
+    is_sampled: bool = False  #: Whether it has no terms and is therefore represented by Chebyshev series
     half_wave: bool = False  #: Whether each half period after `settled` is the negative of the half period before it
     _breaks: tuple[float, ...] = ()  # Times (s, ascending) at which the waveform is not smooth
     _quick: float = math.inf  # Shortest time scale (s) between them
@@ -116,11 +117,6 @@ class Waveform(Remembering):
             such form.
         """
         return None
-
-    @property
-    def is_sampled(self) -> bool:
-        """Whether it has no terms and is therefore represented by Chebyshev series."""
-        return type(self).terms is Waveform.terms
 
     def tone(self) -> float | None:
         """Frequency (Hz) of the fundamental, or None."""
@@ -436,8 +432,8 @@ class _Combination(Waveform):
         super().__post_init__()
         settled = max(part.settled for part in self.parts)
         first, last = zip(*(part.course for part in self.parts), strict=True)
-        course, period = (min(first), max(last)), _common_period(self.parts)
-        self._declare(period=period, settled=settled, course=course)
+        course, sampled = (min(first), max(last)), any(part.is_sampled for part in self.parts)
+        self._declare(period=_common_period(self.parts), settled=settled, course=course, is_sampled=sampled)
 
     def shortest_time(self, start: float = -math.inf, stop: float = math.inf) -> float:
         rate = sum(1.0 / part.shortest_time(start, stop) for part in self.parts)
@@ -452,10 +448,6 @@ class _Combination(Waveform):
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
         blocks = [part.terms(start, stop) for part in self.parts]
         return None if any(block is None for block in blocks) else reduce(self._joined_terms, blocks)
-
-    @property
-    def is_sampled(self) -> bool:
-        return any(part.is_sampled for part in self.parts)
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         return np.unique(np.concatenate([part.breakpoints(t0, t1) for part in self.parts]))
