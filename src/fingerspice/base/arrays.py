@@ -118,14 +118,13 @@ class Remembering:
     def remember(self, key: tuple[Any, ...], make: Callable[[], T], most: int = 16) -> T:
         """The result of `make`, kept by its key, of which at most `most` share the first part; else all of these go.
 
-        Other threads may remove entries at any time, so that an entry is looked up only once.
+        Other threads may remove entries at any time, or call `make` too, with the same result.
         """
         found: tuple[T] | None = self.kept.get(key)
         if found is None:
             alike = [name for name in list(self.kept) if name[0] == key[0]]
             for name in alike if len(alike) >= most else ():
                 self.kept.pop(name, None)
-            # Two threads may both call `make`, with the same result.
             found = self.kept[key] = (make(),)
         return found[0]
 

@@ -78,10 +78,10 @@ _ROUNDING = 1e-11
 # far from the order. Under a recording it is 3, which would give a seventh, and 2 at those zeros; but 1, which gives 1,
 # for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
 _STATED, _STATED_JUMPING, _STATED_RECORDED, _STATED_DISPERSIVE = 0.25, 0.5, 0.5, 1.0
-# It is more of gap voltages, which show the kinks at their zeros more than means do; where a step is longer than this
-# many of the fastest time constants, so that the start of a run from rest is not resolved; and after a start away from
-# 0 V, as what decays then meets steps of several lengths, whose errors may cancel with half the steps.
-_STATED_MORE, _STIFF = 0.8, 2.0
+# It is more of gap voltages, which show the kinks at their zeros more than means do; after a start away from 0 V, as
+# what decays then meets steps of several lengths, whose errors may cancel; and where steps of more than this many of
+# the fastest time constants do not resolve a start from rest, most of all in runs of at most a period.
+_STATED_MORE, _STATED_BEGINNING, _STIFF = 0.8, 2.0, 2.0
 # Rounding error of a run in which the area's polynomial has degree d, relative: 2^d times this, by which the powers'
 # coefficients are larger than those of Chebyshev's series. And, in a derivative, that of all else.
 _EPS, _ROUNDING_OF_SLOPES = 4.4e-16, 1e-13
@@ -464,8 +464,9 @@ class Ladder:
         # The area's polynomial of the run with half the steps may be another one.
         change, decays = np.max(changes, axis=0) + run.coarse[-1], self.decays[pending]
         # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
-        more = self.task.traced | (2.0 * decays > _STIFF * level.steps) | (self.least[pending] > decays)
-        share: FloatArray | float = np.where(more, _STATED_MORE, _STATED)
+        begins = 2.0 * decays > _STIFF * level.steps
+        more = np.where(self.task.traced | begins | (self.least[pending] > decays), _STATED_MORE, _STATED)
+        share: FloatArray | float = np.where(begins & (level.halves <= 2), _STATED_BEGINNING, more)
         if self.form.recording is not None:
             share = _STATED_RECORDED if self.form.stack.c.size == len(self.form.stack.layers) else _STATED_DISPERSIVE
         elif self.form.jumping:
