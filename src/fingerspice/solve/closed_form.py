@@ -356,8 +356,7 @@ def _path(problem: Problem, t: float, y: FloatArray, sources: Sources, u: float,
         if left < 0:
             raise _LostError
         margin, speed = at(z)
-        along: FloatArray = np.concatenate([dy * margin, [margin, speed]]) * pace / scale
-        return along
+        return np.asarray(np.concatenate([dy * margin, [margin, speed]]) * pace / scale)
 
     def jacobian(s: float, z: FloatArray) -> FloatArray:
         # By plain differences: scipy enlarges its own without limit for what nothing depends on.

@@ -126,7 +126,8 @@ class Track(Stepping):
 
     def load(self, initial: State) -> None:
         super().load(initial)
-        (self.y[:], u_gap), self.control["u_before"] = to_loop(self.problem.scene, initial), initial.s_before[0]
+        began = self.problem.inner if initial is self.problem.initial else to_loop(self.problem.scene, initial)
+        (self.y[:], u_gap), self.control["u_before"] = began, initial.s_before[0]
         if self.system.model.mobile and self.sign[0] != 0.0:
             self.control["u_gap"], self.control["sign"] = u_gap, math.copysign(1.0, u_gap)
 

@@ -171,8 +171,9 @@ def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
         (span / waveform.shortest_time(), "periods or time constants", MOST_PERIODS),
         (span * waveform.breakpoint_rate(), "breakpoints", MOST_BREAKPOINTS),
     ):
-        told = f"{span:g} s long, {count:.3g} {what} of its source"
-        require(count <= most, "the run", told, f"at most {most:.0e} of them")
+        if not count <= most:
+            told = f"{span:g} s long, {count:.3g} {what} of its source"
+            raise InputError(f"the run is {told}; allowed: at most {most:.0e} of them")
 
 
 def check_outputs(circuit: Circuit, count: float) -> None:
@@ -183,9 +184,9 @@ def check_outputs(circuit: Circuit, count: float) -> None:
         return sum(of_device.get(e.device, 0) + e.spec.is_layer for e in circuit.elements) + len(nodes) + 1
 
     size = 8.0 * (signals := circuit.remember(("signals",), counted)) * count
-    told = f"one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB"
-    allowed = f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning"
-    require(size <= MOST_BYTES, "the run", told, allowed)
+    if not size <= MOST_BYTES:
+        told = f"the run is one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB; allowed: at most"
+        raise InputError(f"{told} {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning")
 
 
 def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:

@@ -157,8 +157,8 @@ def check_arguments(
         known = [*METHODS, *(f"{library}:NAME" for library in LIBRARIES)]
         raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
     area_given(area)
-    known_start = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
-    require(known_start, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
+    if not (isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)):
+        raise InputError(f"start is {start!r}; allowed: {', '.join(map(repr, STARTS))} or a Solution")
     return rtol_given(rtol)
 
 

@@ -93,12 +93,12 @@ class Stepping(Integration):
     def look_for_period(self, rates: FloatArray, scale: FloatArray, repeat: bool) -> None:
         """Prepare the looks of the run, none unless it is to `repeat` a period; `rates` (1/s) are those at 0 V."""
         problem, values = self.problem, np.zeros(loop.N_VALUES)
-        start, live = max(problem.t_start, problem.network.waveform.settled), rates[rates > 0.0]
+        start, live = max(problem.t_start, problem.network.waveform.settled), [x for x in rates.flat if x > 0.0]
         values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, self.period
         values[loop.ALLOWED], values[loop.HAS_CHARGE] = _SHARE * self.pace.tol, problem.charge
         values[loop.LOOKED] = -1.0
         # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
-        values[loop.RATE] = loop.RATE_SHARE * float(live.min()) if live.size else math.inf
+        values[loop.RATE] = loop.RATE_SHARE * float(min(live, default=math.inf))
         values[loop.DISTANCE] = values[loop.REMAINING] = values[loop.TRIAL] = math.inf
         self.periods = (problem.t_stop - start) / self.period * (1.0 + 1e-12)
         values[loop.NEXT] = start if repeat and self.periods >= FEWEST_PERIODS else math.inf
@@ -160,28 +160,28 @@ class Stepping(Integration):
             if code != readout.PAUSED:
                 return code
 
-    def stated_peaks(self) -> FloatArray:
+    def stated_peaks(self) -> list[list[float]]:
         """Peaks so far, of every area's gap and of the nodes, with their stated errors: estimates and round-off."""
         found = []
         for (u, f, u_error, f_error), floor in zip(self.peaks.tolist(), self.rounding, strict=True):
             # F ~ u^2 A, and A falls with u.
             steepest = 2.0 * f / u if u > 0.0 else 0.0
-            found.append((u, f, SAFETY * u_error + floor, SAFETY * f_error + floor * steepest))
-        return np.array(found)
+            found.append([u, f, SAFETY * u_error + floor, SAFETY * f_error + floor * steepest])
+        return found
 
     def stated(self, run: Run) -> None:
         """Write the stated errors and the margin into a run."""
         peaks = self.stated_peaks()
-        run.gaps, run.margin = peaks[self.gaps], self.margin
-        run.node_error = float(peaks[-1, readout.ERROR_U])
+        run.gaps, run.margin = np.array([peaks[i] for i in self.gaps]).reshape(-1, 4), self.margin
+        run.node_error = peaks[-1][readout.ERROR_U]
         if not self.pace.charge:
             return
         # Errors of unknown sign are the same in every period: they add up from one to the next, instead of cancelling.
-        period, steps = self.problem.network.waveform.period, 1.0 + float(self.counters[readout.ACCEPTED])
-        alike = (self.t - self.problem.t_start) / period - self.repeated if period else 0.0
+        steps = 1.0 + float(self.counters[readout.ACCEPTED])
+        alike = (self.t - self.problem.t_start) / self.period - self.repeated
         known, spread = float(self.control["error_q"]), max(self.collected[1].tolist(), default=0.0)
         estimate = SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
-        held = self.capacitance * (self.largest + max(peaks[:, readout.PEAK_U].tolist()))
+        held = self.capacitance * (self.largest + max(peak[readout.PEAK_U] for peak in peaks))
         moved = max(float(self.control["peak_q"]), *map(abs, self.y[-self.s_before.size :].tolist()))
         # Every step adds the round-off of the charge that is held, and the relative error of the areas' polynomials is
         # also a relative error of all charge moved.
@@ -199,7 +199,7 @@ class Stepping(Integration):
             if code == readout.LOOKED_AT:
                 self._settle()
             elif code == readout.EXCESSIVE:
-                if excess_of(self.stated_peaks()[self.gaps], self.problem.rounding) > self.asked:
+                if excess_of(np.array(self.stated_peaks())[self.gaps], self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
             elif code != readout.DONE:
                 return self.failed(code, sources)

@@ -383,5 +383,4 @@ class _Run(torch.autograd.Function):
 def _slopes(ctx: Any, wanted: tuple[str, ...]) -> Tensor:
     """Derivatives of a run's outputs by the parameters `wanted`."""
     refuse(ctx.wanted, "second derivatives of a run are asked for; allowed: first derivatives")
-    found: Tensor = _Run.apply(ctx.scenes, ctx.paths, wanted, *ctx.saved_tensors)
-    return found
+    return _Run.apply(ctx.scenes, ctx.paths, wanted, *ctx.saved_tensors)
