@@ -179,7 +179,7 @@ def waits(folder: Path) -> str:
     sources = ", ".join(row["source"] for row in base["times"] if row["circuit"] == "fingerpad")
     rows = [
         ["what you wait for", "time"],
-        ["`import fingerspice`", f"{run['import_s']:.2f} s"],
+        ["`import fingerspice`", f"{max(0.0, run['import_s']):.2f} s"],
         [
             "`fingerspice run` of Table 1, without / with picture",
             f"{run['run_no_plot_s']:.1f} / {run['run_s']:.1f} s",
