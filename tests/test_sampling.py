@@ -372,3 +372,11 @@ def test_a_function_that_rises_out_of_next_to_nothing_costs_no_more(middle: floa
     assert bump.values < 200_000
     # Capacitors alone share it as 0.9, resistors alone as 0.5.
     assert 50.0 < run.u_gap_peak < 92.0
+
+
+def test_a_waveform_of_one_s_own_without_terms_is_sampled() -> None:
+    own = type(
+        "Own", (fs.Waveform,), {"_quick": 0.01, "value": lambda self, t, side="right": fs.Sine(200, 100).value(t)}
+    )
+    reasons = fs.plan(table1(), sources=own(), t_stop=0.02).reasons
+    assert any("a source is a function" in reason for reason in reasons)

@@ -49,7 +49,6 @@ class Function(Waveform):
     function: Callable[..., object]
     breaks: tuple[float, ...] = ()
     repeat: float | None = None
-    is_sampled = True
 
     def __post_init__(self) -> None:
         require(callable(self.function), "source function", repr(self.function), "a function of time in s")

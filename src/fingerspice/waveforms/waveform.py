@@ -67,6 +67,7 @@ class Waveform(Remembering):
 
     def __init_subclass__(cls) -> None:
         cls.units = cls.units | {x: UNITS[kind] for x, kind in inspect.get_annotations(cls).items() if kind in UNITS}
+        cls.is_sampled = cls.terms is Waveform.terms
 
     def __post_init__(self) -> None:
         """Make doubles of the fields that have a unit, and refuse what is no number of it."""
