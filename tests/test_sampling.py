@@ -378,5 +378,4 @@ def test_a_waveform_of_one_s_own_without_terms_is_sampled() -> None:
     own = type(
         "Own", (fs.Waveform,), {"_quick": 0.01, "value": lambda self, t, side="right": fs.Sine(200, 100).value(t)}
     )
-    reasons = fs.plan(table1(), sources=own(), t_stop=0.02).reasons
-    assert any("a source is a function" in reason for reason in reasons)
+    assert any("a source is a function" in reason for reason in fs.plan(table1(), sources=own(), t_stop=0.02).reasons)
