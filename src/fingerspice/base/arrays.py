@@ -122,7 +122,7 @@ class Remembering:
         """
         found: tuple[T] | None = self.kept.get(key)
         if found is None:
-            alike = [name for name in list(self.kept) if name[0] == key[0]]
+            alike = [name for name in list(self.kept) if name[0] == key[0]] if len(self.kept) >= most else ()
             for name in alike if len(alike) >= most else ():
                 self.kept.pop(name, None)
             found = self.kept[key] = (make(),)

@@ -384,24 +384,28 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
     window, because the ends of the run would count as jumps. For a run of too many samples the spectra of several
     pieces spread over the run are added. A source with values that are not finite has energy 0.
     """
-    t0, span, rate, pieces = 0.0, t_stop, 4.0 * highest, 1
-    if (periodic := waveform.period) is not None:
-        t0, span = waveform.settled, periodic
-    elif span * rate > _MOST_SAMPLES:
-        own = max(2.0 * waveform.breakpoint_rate(), 16.0 / waveform.shortest_time())
-        rate = min(rate, own or rate)
-        pieces = 1 if span * rate <= _MOST_SAMPLES else _PIECES
-    count = _enough(span, rate) // pieces
-    length = span if pieces == 1 else count / rate
-    window = 1.0 if periodic is not None else _window(count)
-    total: FloatArray = np.zeros(1)
-    for start in np.linspace(t0, t0 + span - length, pieces).tolist():
-        u = _samples(waveform, start, start + length, count)
-        if not np.all(np.isfinite(u)):
-            return np.zeros(1), np.zeros(1)
-        total = total + np.abs(np.fft.rfft(u * window)) ** 2
-    total[1:] *= 2.0
-    return np.arange(total.size) / length, total
+
+    def make() -> tuple[FloatArray, FloatArray]:
+        t0, span, rate, pieces = 0.0, t_stop, 4.0 * highest, 1
+        if (periodic := waveform.period) is not None:
+            t0, span = waveform.settled, periodic
+        elif span * rate > _MOST_SAMPLES:
+            own = max(2.0 * waveform.breakpoint_rate(), 16.0 / waveform.shortest_time())
+            rate = min(rate, own or rate)
+            pieces = 1 if span * rate <= _MOST_SAMPLES else _PIECES
+        count = _enough(span, rate) // pieces
+        length = span if pieces == 1 else count / rate
+        window = 1.0 if periodic is not None else _window(count)
+        total: FloatArray = np.zeros(1)
+        for start in np.linspace(t0, t0 + span - length, pieces).tolist():
+            u = _samples(waveform, start, start + length, count)
+            if not np.all(np.isfinite(u)):
+                return np.zeros(1), np.zeros(1)
+            total = total + np.abs(np.fft.rfft(u * window)) ** 2
+        total[1:] *= 2.0
+        return np.arange(total.size) / length, total
+
+    return waveform.remember(("energies", t_stop, highest), make, 2)
 
 
 def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | None:

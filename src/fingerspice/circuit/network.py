@@ -114,9 +114,27 @@ class Network(Remembering):
         return np.array([float(c.area(0.0)) if c is not None and a.given is None else a.given for a, c in pairs])
 
     @property
+    def arrays(self) -> tuple[Any, ...]:
+        """The arrays of an `engine.network.Net` that depend on neither areas nor sources."""
+
+        def make() -> tuple[Any, ...]:
+            constants = np.array([(c.c, c.g_total, c.g_area) for c in self.cells], float).reshape(-1, 3).T.copy()
+            place = np.array([-1 if c.area is None else c.area for c in self.cells], np.int64)
+            matrices = self.p, self.q, *constants, place, self.k, self.b, self.through, self.delivered
+            return tuple(map(np.ascontiguousarray, matrices))
+
+        return self.remember(("arrays",), make)
+
+    @cached_property
     def fingers(self) -> tuple[int, ...]:
         """Indices of the areas that a GAP drives."""
         return tuple(i for i, gap in enumerate(self.gaps) if gap is not None)
+
+    @cached_property
+    def named_contacts(self) -> tuple[tuple[str, Contact], ...]:
+        """Name and contact of each GAP."""
+        found = ((self.areas[i].gap, self.contacts[i]) for i in self.fingers)
+        return tuple((gap.name, contact) for gap, contact in found if gap is not None and contact is not None)
 
     def capacitance(self, area: FloatArray) -> FloatArray:
         """Capacitance of every cell at areas (n_area,) in m^2, F, shape (n_cell,)."""

@@ -74,8 +74,12 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
 
 def driving(circuit: Circuit) -> list[Element]:
     """The V and I elements that do not give an area, of any circuit."""
-    areas = {e.nodes[2] for e in circuit.elements if e.spec.is_layer}
-    return [e for e in circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
+
+    def make() -> list[Element]:
+        areas = {e.nodes[2] for e in circuit.elements if e.spec.is_layer}
+        return [e for e in circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
+
+    return circuit.remember(("driving",), make)
 
 
 def driving_sources(circuit: Circuit) -> list[Element]:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.polynomial import chebyshev, legendre
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_fused
+from fingerspice.base.compiled import jit, jit_fused, jit_rows
 
 NODES = 13
 ROWS = 16
@@ -226,3 +226,34 @@ def _cardinal(at: list[Fraction], i: int) -> list[Fraction]:
             higher, lower = [Fraction(0), *out], [*out, Fraction(0)]
             out = [(x - t * y) / (at[i] - t) for x, y in zip(higher, lower, strict=True)]
     return out
+
+
+@jit_rows
+def combine(matrix: FloatArray, rows: FloatArray, since: int, out: FloatArray) -> None:
+    """out += matrix @ rows, at all rows of a step, from column `since` of the matrix on."""
+    n = matrix.shape[1]
+    for c in range(matrix.shape[0]):
+        # Two at a time: the sum is fetched and put back half as often.
+        for k in range(since, n - 1, 2):
+            share, other = matrix[c, k], matrix[c, k + 1]
+            for i in range(ROWS):
+                out[c, i] += share * rows[k, i] + other * rows[k + 1, i]
+        if (n - since) % 2 == 1:
+            share = matrix[c, n - 1]
+            for i in range(ROWS):
+                out[c, i] += share * rows[n - 1, i]
+
+
+@jit_rows
+def multiply(matrix: FloatArray, rows: FloatArray, start: FloatArray | None, out: FloatArray) -> None:
+    """out = matrix @ rows, and `start` if that is given, at all rows of a step."""
+    n, even = matrix.shape[1], matrix.shape[1] % 2 == 0
+    for c in range(matrix.shape[0]):
+        for i in range(ROWS):
+            total = 0.0 if start is None else start[c, i]
+            if n > 0:
+                total += matrix[c, 0] * rows[0, i]
+            if n > 0 and even:
+                total += matrix[c, 1] * rows[1, i]
+            out[c, i] = total
+    combine(matrix, rows, 2 if even else 1, out)

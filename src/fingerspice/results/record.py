@@ -61,14 +61,19 @@ class Sealed:
     """A result whose arrays are read-only, also after copying or unpickling, which both make writable arrays."""
 
     def __post_init__(self) -> None:
-        for value in vars(self).values():
-            for array in value.values() if isinstance(value, dict) else (value,):
-                if isinstance(array, np.ndarray):
-                    array.setflags(write=False)
+        _seal(vars(self))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        Sealed.__post_init__(self)
+        _seal(state)
+
+
+def _seal(values: dict[Any, Any]) -> None:
+    for value in values.values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+        elif isinstance(value, dict):
+            _seal(value)
 
 
 def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray | None:
@@ -270,11 +275,7 @@ class Record(Signals):
     rows: FloatArray
     has_charge: bool = False
 
-    @cached_property
-    def fingers(self) -> tuple[tuple[str, Contact], ...]:  # type: ignore[override]
-        found = ((self.network.areas[i].gap, self.network.contacts[i]) for i in self.network.fingers)
-        return tuple((gap.name, contact) for gap, contact in found if gap is not None and contact is not None)
-
+    fingers = cached_property(lambda self: self.network.named_contacts)
     layers = cached_property(lambda self: tuple(e.name for e in self.network.layers))
     sources = cached_property(lambda self: tuple(e.name for e in self.network.sources))
 

@@ -96,7 +96,8 @@ def system_of(
     u_max, n = u_peak or max(scene.u_peak, u_top), model.gap.size
     nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
     u_range = inverse_area_range(u_max, 17, model.curve)
-    return systems.build_system(model, area_error(decade), u_range, scene.network.stack.grouping, nodes, stress, ratio)
+    grouping = scene.shown.turn[:, None] * scene.network.stack.grouping
+    return systems.build_system(model, area_error(decade), u_range, grouping, nodes, stress, ratio)
 
 
 class Track(Stepping):
@@ -160,14 +161,13 @@ class Track(Stepping):
         return bool(met)
 
     def completed(self) -> None:
-        n_out, model, shown = int(self.counters[readout.OUTPUT]), self.system.model, self.problem.scene.shown
-        rows, n = self.rows[:n_out], shown.turn.size
-        rows[:, :n] *= shown.turn
+        model, shown = self.system.model, self.problem.scene.shown
         if self.pace.charge and model.mobile:
-            (cell,), network = shown.measured, shown.network
+            n_out, n, (cell,) = int(self.counters[readout.OUTPUT]), shown.turn.size, shown.measured
+            columns, network = self.out[:, :n_out], shown.network
             u = sided(self.problem.network.waveform, self.t_out[:n_out], self.left[:n_out])
-            u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
-            rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s
+            u_gap = np.einsum("kt,k->t", columns[:n], network.p[cell]) + network.q[cell, 0] * u
+            columns[n] += u / inverse_areas(u_gap, model.curve) / model.s
 
     def row(self, state: State, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
         row = super().row(state, sources, side)
@@ -390,8 +390,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
     if is_stack:
         # The largest gap voltage to expect.
-        share = met * model_of(problem.scene).k_gap if np.isfinite(met) else 0.0
-        u_scale = max(share, float(np.abs(problem.inner[0][:-1]).max(initial=0.0))) or GUESS
+        u_scale = max(met * model_of(problem.scene).k_gap if met < math.inf else 0.0, problem.stored) or GUESS
     else:
         u_scale = max(problem.largest, met) or GUESS
     tol, top, nfev, attempts, tries_out = LOCAL_SHARE * rtol, 0.0, 0, 0, True

@@ -59,7 +59,7 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
     """The model for a problem with this error and tier asked for; a method that is named steps the coupled one."""
     refuse(tier not in ("auto", *TIERS), f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
     asked = "coupled" if tier == "auto" and method != "auto" else tier
-    key = ("plan", rtol, asked, problem.start, problem.charge, _stores(problem), problem.t_start, problem.t_stop)
+    key = ("plan", rtol, asked, problem.start, problem.charge, problem.stored, problem.t_start, problem.t_stop)
     return problem.scene.remember(key, lambda: _plan(problem, rtol, asked), MOST_PLANS)
 
 
@@ -116,11 +116,6 @@ def _refuse(problem: Problem, tier: str, best: str) -> None:
         raise InputError(f"the linear tier takes the area as fixed, and {what} needs the one that follows the voltage")
 
 
-def _stores(problem: Problem) -> bool:
-    """Whether a stack starts with charge on the interfaces between its layers."""
-    return problem.network.stack is not None and bool(problem.inner[0][:-1].any())
-
-
 def _of_network(problem: Problem, changed: float) -> tuple[str, str]:
     """The tier of a network, and the reason: linear where its areas are fixed, else coupled.
 
@@ -140,12 +135,12 @@ def _of_network(problem: Problem, changed: float) -> tuple[str, str]:
 
 def _of_stack(problem: Problem, model: Model, rtol: float, changed: float) -> tuple[str, str]:
     """The tier of a stack, the lightest of all three that is valid, and the reason."""
-    leaks = np.any((model.rate > 0.0) | (model.rate0 > 0.0))
-    if not leaks and not (model.mobile and model.coupled and _stores(problem)):
+    leaks = model.rate.any() or model.rate0.any()
+    if not leaks and not (model.mobile and model.coupled and problem.stored > 0.0):
         return "algebraic", "no layer leaks, so the voltages follow the source at once"
     if not model.coupled:
         return "linear", f"the area is {problem.scene.area_mode}, so the circuit is linear"
-    free = not np.any(model.rate0 > 0.0)
+    free = not model.rate0.any()
     if model.mobile or not (free or changed <= 0.2 * rtol):
         return "coupled", f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
     if problem.charge:

@@ -90,6 +90,11 @@ class Problem:
         """The start of a stack in its own equations, as in `to_loop`."""
         return to_loop(self.scene, self.initial)
 
+    @cached_property
+    def stored(self) -> float:
+        """Largest voltage of a stack's start that its source does not give, V: charge between its layers."""
+        return max(map(abs, self.inner[0][:-1].tolist() if self.network.stack else ()), default=0.0)
+
     def done(self, t: float) -> float:
         """Fraction of the run that is done at time t, s."""
         return (t - self.t_start) / (self.t_stop - self.t_start)

@@ -121,7 +121,9 @@ class Integration(ABC):
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.net = problem, problem.scene.net
-        self.t_out, self.left = read_only(problem.t_out), read_only(problem.left)
+        # What is written on the way: also the outputs at the end, if no source may jump there.
+        left = problem.left if after_the_end(problem) else problem.left | (problem.t_out == problem.t_stop)
+        self.t_out, self.left = read_only(problem.t_out), read_only(left)
         self.n, n_s = map(int, self.net.b.shape)
         # The state reached, as in `State`.
         self.y, self.sign = problem.initial.y.copy(), problem.initial.sign.copy()
@@ -177,7 +179,7 @@ class Integration(ABC):
 
 def integrate(one: Integration, tables: Tables, progress: Progress | None = None) -> Run:
     """Run an integration to its end or to its failure; the caller adds the stated error."""
-    problem, t_out, left = one.problem, one.t_out, one.left
+    problem, t_out = one.problem, one.t_out
     status, t_failed = Status.SUCCESS, None
     sources: Sources | None = None
     tables.done = -np.inf
@@ -204,7 +206,7 @@ def integrate(one: Integration, tables: Tables, progress: Progress | None = None
     rows = one.rows[: int(one.counters[OUTPUT])]
     stats = {name: int(one.counters[i]) for name, i in (("steps", ACCEPTED), ("rejected", REJECTED), ("zeros", ZEROS))}
     return Run(
-        t_out[: len(rows)], left[: len(rows)], rows, status, int(one.counters[NFEV]), stats, state,
+        t_out[: len(rows)], problem.left[: len(rows)], rows, status, int(one.counters[NFEV]), stats, state,
         t_failed=t_failed, tried=one.tried, unseen=tables.unseen, rough=tables.rough, detail=one.detail,
         here=here,
     )  # fmt: skip

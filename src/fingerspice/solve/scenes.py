@@ -70,15 +70,8 @@ class Scene(Remembering):
         padded = np.zeros((count, max((c.size for c in curves), default=1)))
         for row, curve in zip(padded, curves, strict=True):
             row[: curve.size] = curve
-        constants = np.array([(c.c, c.g_total, c.g_area) for c in network.cells], float).reshape(-1, 3).T.copy()
-        place = np.array([-1 if c.area is None else c.area for c in network.cells], np.int64)
         slow = np.where(tau > 0.0, np.cumsum(tau > 0.0) - 1, -1)
-        matrices = network.p, network.q, network.k, network.b, network.through, network.delivered
-        p, q, k, b, through, delivered = map(np.ascontiguousarray, matrices)
-        return Net(
-            self.charge_law == "mobile", p, q, constants[0], constants[1], constants[2], place, k, b, through,
-            delivered, gap, area0, tau, slow, padded,
-        )  # fmt: skip
+        return Net._make((self.charge_law == "mobile", *network.arrays, gap, area0, tau, slow, padded))
 
     @property
     def shown(self) -> Scene:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.collocation import loop, readout
 from fingerspice.engine.collocation.loop import Circuit, Looks
 from fingerspice.engine.collocation.readout import LoopState, Outputs
@@ -21,7 +21,6 @@ from fingerspice.results.record import Record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
-from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.sampling import same_time
 
 # Runs of fewer periods are integrated throughout, because nothing would be saved.
@@ -98,7 +97,7 @@ class Stepping(Integration):
         values[loop.ALLOWED], values[loop.HAS_CHARGE] = _SHARE * self.pace.tol, problem.charge
         values[loop.LOOKED] = -1.0
         # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
-        values[loop.RATE] = loop.RATE_SHARE * float(min(live, default=math.inf))
+        values[loop.RATE] = loop.RATE_SHARE * min(live, default=math.inf)
         values[loop.DISTANCE] = values[loop.REMAINING] = values[loop.TRIAL] = math.inf
         self.periods = (problem.t_stop - start) / self.period * (1.0 + 1e-12)
         values[loop.NEXT] = start if repeat and self.periods >= FEWEST_PERIODS else math.inf
@@ -269,9 +268,5 @@ class Stepping(Integration):
     def recorded(self) -> Recorded | None:
         """The recorded steps of the run so far."""
         self.recorder.drain(self.counters)
-        return self.recorder.finish(self.problem.first, partial(_record, self.problem.scene.shown))
-
-
-def _record(shown: Scene, t: FloatArray, left: BoolArray, rows: FloatArray) -> Record:
-    """A record without charge from recorded states, shape (n_t, size), which of a stack are counted along the loop."""
-    return Record(shown.network, shown.net, t, left, rows if shown.network.stack is None else shown.turn * rows)
+        shown = self.problem.scene.shown
+        return self.recorder.finish(self.problem.first, partial(Record, shown.network, shown.net))

@@ -16,6 +16,7 @@ from fingerspice.engine.collocation.readout import Modal, row_of
 from fingerspice.engine.many_areas.form import evaluate_many, probe_many
 from fingerspice.engine.one_area.rows import evaluate_one, largest_size, probe_one
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
+from fingerspice.numerics.modes import copy_to
 
 
 @jit_rows
@@ -63,9 +64,10 @@ def converge(circuit: Any, state: Any, tol: float) -> tuple[int, bool, float]:
             respond(used, phi, base, w)
         if not _evaluate(circuit, state):
             return iteration, False, answer
-        change = moved(u, guess)
         if iteration == 1:
+            copy_to(guess, u)
             continue
+        change = moved(u, guess)
         # The next change of the gap voltages: their last one, times the ratio of the nonlinear term's changes.
         left = distance(pull, used, weight)
         if iteration == 2 and step > 0.0:
@@ -250,7 +252,7 @@ def largest(first: float, second: float, third: float) -> float:
 # Shift of the gap voltages for a difference, over the largest of them: half of the digits are left.
 _SHIFT = 1e-7
 # Answer of the areas up to which it is neglected: the error carried changes by at most 6 times as much of itself.
-_SLIGHT = 0.01
+_SLIGHT = 0.02
 # Most iterations, and the move over the shift below which the next iteration does not matter.
 _PASSES, _ENOUGH = 6, 0.3
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
 from fingerspice.numerics.chebyshev import to_powers
-from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES
+from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES, multiply
 from fingerspice.numerics.modes import copy_to
 
 CONTROL = np.dtype([
@@ -159,8 +159,9 @@ def basis_at(theta: float, basis: FloatArray) -> None:
     for j in range(NODES):
         basis[j] = BARYCENTRIC[j] / (theta - POINTS[j])
         total += basis[j]
+    share = 1.0 / total
     for j in range(NODES):
-        basis[j] /= total
+        basis[j] *= share
 
 
 @jit_rows
@@ -201,13 +202,8 @@ def layers(
     q: FloatArray, values: FloatArray,
 ) -> None:  # fmt: skip
     """Recorded voltages at all rows."""
+    multiply(shown, w, None, values)
     for i in range(shown.shape[0]):
-        for j in range(ROWS):
-            values[i, j] = 0.0
-        for k in range(w.shape[0]):
-            share = shown[i, k]
-            for j in range(ROWS):
-                values[i, j] += share * w[k, j]
         if mobile:
             for j in range(ROWS):
                 values[i, j] *= area0 * q[j]

@@ -18,7 +18,7 @@ from fingerspice.engine.collocation.step_control import first_wrong
 from fingerspice.engine.many_areas import form as forms
 from fingerspice.engine.many_areas.form import Form, Work
 from fingerspice.engine.one_area.charge import LOBE, integrate
-from fingerspice.numerics.lobatto import DERIVATIVE, END, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import DERIVATIVE, END, NODES, POINTS, ROWS, combine, multiply
 from fingerspice.numerics.modes import apply
 
 # A decay that is over within this fraction of the step, a third of the way to the first node, is not seen by the
@@ -149,13 +149,11 @@ def write_columns(
 ) -> None:
     """Write the state at all rows into the first rows of `values`; charges, if wanted, as gained since the start."""
     n, m = shape.shape[0], w.shape[0]
+    multiply(follow, s, None, values)
     for j in range(n):
         for i in range(ROWS):
-            values[j, i] = 0.0
-        for e in range(s.shape[0]):
-            for i in range(ROWS):
-                values[j, i] -= follow[j, e] * s[e, i]
-    forms.combine(shape, w[:n], values[:n])
+            values[j, i] = -values[j, i]
+    combine(shape, w, 0, values)
     for k in range(n, m):
         for i in range(ROWS):
             values[k, i] = w[k, i]
@@ -204,20 +202,18 @@ def _charge_rows(
     u, more, j, room = work.cells[forms.CELL_U], work.areas[forms.MORE], work.cells[forms.J], work.room
     n = stored.shape[1]
     collected, leak, moved = room[0], room[1], room[2]
+    multiply(stored, rate, None, current)
+    combine(stored_s, ds, 0, current)
     for a in range(stored.shape[0]):
+        multiply(lost[a : a + 1], w, None, room[:1])
+        combine(lost_s[a : a + 1], s, 0, room[:1])
         for i in range(ROWS):
             z[a, i] = 0.0
-            current[a, i] = 0.0
-            collected[i] = 0.0
         for k in range(n):
             for i in range(ROWS):
-                current[a, i] += stored[a, k] * rate[k, i]
-                collected[i] += lost[a, k] * w[k, i]
                 z[a, i] += stored[a, k] * (w[k, i] - w[k, 0])
         for k in range(s.shape[0]):
             for i in range(ROWS):
-                current[a, i] += stored_s[a, k] * ds[k, i]
-                collected[i] += lost_s[a, k] * s[k, i]
                 z[a, i] += stored_s[a, k] * (s[k, i] - s[k, 0])
         for i in range(ROWS):
             current[a, i] += collected[i]
@@ -369,9 +365,9 @@ def step_charges(
     """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
     cells, w, cell_u = work.cells, work.modal.w, work.cells[forms.CELL_U]
     forms.mode_rates(h, form.rates, w, work.lin, work.modal.pull, False, work.d)
-    forms.multiply(form.tap, w[: form.shape.shape[0]], None, cell_u)
-    forms.combine(form.tap_s, work.s, cell_u)
-    forms.multiply(work.own.root, cells[forms.RHO], None, cells[forms.J])
+    multiply(form.tap, w[: form.shape.shape[0]], None, cell_u)
+    combine(form.tap_s, work.s, 0, cell_u)
+    multiply(work.own.root, cells[forms.RHO], None, cells[forms.J])
     if not form.mobile:
         for a in range(form.cell.size):
             if form.cell[a] >= 0 and form.slow[a] < 0:

@@ -27,7 +27,7 @@ from fingerspice.engine.many_areas import coupling as couplings
 from fingerspice.engine.network import Sources
 from fingerspice.engine.one_area import rows as stack_rows
 from fingerspice.engine.one_area.rows import polynomial_rows
-from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, POINTS, ROWS, combine, multiply
 from fingerspice.numerics.modes import copy_to
 from fingerspice.physics.contact import inverse_area
 
@@ -170,30 +170,6 @@ TO_RATES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN.T @ DERIVATIVE]).
 
 
 @jit_rows
-def combine(matrix: FloatArray, rows: FloatArray, out: FloatArray) -> None:
-    """out += matrix @ rows, at all rows of a step."""
-    n = matrix.shape[1]
-    for c in range(matrix.shape[0]):
-        # Two at a time: the sum is fetched and put back half as often.
-        for k in range(0, n - 1, 2):
-            share, other = matrix[c, k], matrix[c, k + 1]
-            for i in range(ROWS):
-                out[c, i] += share * rows[k, i] + other * rows[k + 1, i]
-        share = matrix[c, n - 1] if n % 2 == 1 else 0.0
-        for i in range(ROWS if n % 2 == 1 else 0):
-            out[c, i] += share * rows[n - 1, i]
-
-
-@jit_rows
-def multiply(matrix: FloatArray, rows: FloatArray, start: FloatArray | None, out: FloatArray) -> None:
-    """out = matrix @ rows, and `start` if that is given, at all rows of a step."""
-    for c in range(matrix.shape[0]):
-        for i in range(ROWS):
-            out[c, i] = 0.0 if start is None else start[c, i]
-    combine(matrix, rows, out)
-
-
-@jit_rows
 def mode_rates(
     h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, pull: FloatArray, stiff_only: bool, out: FloatArray
 ) -> None:
@@ -309,7 +285,7 @@ def _evaluate(
             _subtract(area[a], form.area0[a], more[a])
     multiply(coupling.from_modes, w, cells[ETA_S], eta)
     if stiff:
-        combine(coupling.from_stiff, d[:n], eta)
+        combine(coupling.from_stiff, d[:n], 0, eta)
     if mobile:
         multiply(coupling.held, w, cells[CHI_S], cells[CHI])
         answer_mobile(form, work, several, cells, areas, least)
@@ -321,7 +297,7 @@ def _evaluate(
         couplings.answer_together(form.home, coupling.answer, coupling.cross, more, cells[SHARE], eta, rho)
     else:
         couplings.answer_alone(form.home, coupling.answer, more, eta, rho)
-    combine(coupling.feed, rho, pull[:n])
+    combine(coupling.feed, rho, 0, pull[:n])
     return True
 
 
@@ -365,8 +341,8 @@ def follow_sources(form: Form, work: Work) -> None:
     n = form.gap.shape[1]
     multiply(form.gain, s, None, lin)
     multiply(coupling.from_rates, lin[:n], None, cells[ETA_S])
-    combine(coupling.from_slopes, ds, cells[ETA_S])
-    combine(coupling.from_sources, s, cells[ETA_S])
+    combine(coupling.from_slopes, ds, 0, cells[ETA_S])
+    combine(coupling.from_sources, s, 0, cells[ETA_S])
     multiply(coupling.from_slopes, s, None, cells[CHI_S])
     multiply(form.gap_s, s, None, areas[U_S])
 

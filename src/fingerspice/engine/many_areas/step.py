@@ -24,7 +24,7 @@ from fingerspice.engine.many_areas.form import Form, Work
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.engine.one_area.model import dot
 from fingerspice.engine.one_area.system import LEVEL_RATIO
-from fingerspice.numerics.lobatto import END, NODES, POINTS
+from fingerspice.numerics.lobatto import END, NODES, POINTS, combine, multiply
 from fingerspice.numerics.modes import apply, copy_to
 from fingerspice.physics.contact import inverse_area
 
@@ -420,8 +420,8 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
     form, work, spare = c.form, c.work, c.work.spare_cells
     _take_coupling(c, s, 0.0)
     forms.clear(spare[forms.ETA])
-    forms.multiply(work.own.held, work.modal.w[: form.shape.shape[0]], None, spare[forms.CHI])
-    forms.combine(work.own.from_slopes, work.s, spare[forms.CHI])
+    multiply(work.own.held, work.modal.w[: form.shape.shape[0]], None, spare[forms.CHI])
+    combine(work.own.from_slopes, work.s, 0, spare[forms.CHI])
     forms.answer_mobile(form, work, s.step[0].several > 0, spare, work.areas, work.room[3])
     least: float = work.room[3, :NODES].min()
     return 1.0 / least

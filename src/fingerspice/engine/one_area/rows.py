@@ -13,7 +13,7 @@ from fingerspice.engine.collocation.readout import N_PLACES, Modal, new_modal
 from fingerspice.engine.network import term_at
 from fingerspice.engine.one_area.system import DEGREE, System
 from fingerspice.numerics import chebyshev
-from fingerspice.numerics.lobatto import POINTS, ROWS
+from fingerspice.numerics.lobatto import POINTS, ROWS, multiply
 from fingerspice.numerics.modes import copy_to
 from fingerspice.physics.contact import inverse_area
 
@@ -163,43 +163,19 @@ def _long_area(curve: FloatArray, sign: float, r: FloatArray) -> None:
 
 
 @jit_rows
-def _gap_voltage(
-    k_gap: float, gap: FloatArray, w: FloatArray, source: FloatArray, x: FloatArray, u: FloatArray
-) -> None:
-    """x = gap w and u = k_gap U + gap w."""
-    for i in range(ROWS):
-        x[i] = 0.0
-    for k in range(w.shape[0]):
-        share = gap[k]
-        for i in range(ROWS):
-            x[i] += share * w[k, i]
+def _gap_voltage(k_gap: float, source: FloatArray, x: FloatArray, u: FloatArray) -> None:
+    """u = k_gap U + x."""
     for i in range(ROWS):
         u[i] = k_gap * source[i] + x[i]
 
 
 @jit_rows
-def _pull(
-    tap: FloatArray, tap_k: FloatArray, feed: FloatArray, q0: float, source: FloatArray, q: FloatArray, w: FloatArray,
-    tapped: FloatArray, pull: FloatArray,
-) -> None:  # fmt: skip
-    """pull = feed (q - q0) (tap w + tap_k U)."""
-    for t in range(tap.shape[0]):
+def _leaked(tap_k: FloatArray, q0: float, source: FloatArray, q: FloatArray, tapped: FloatArray) -> None:
+    """(q - q0) (tapped + tap_k U), in place."""
+    for t in range(tap_k.size):
         share = tap_k[t]
         for i in range(ROWS):
-            tapped[t, i] = share * source[i]
-        for k in range(w.shape[0]):
-            factor = tap[t, k]
-            for i in range(ROWS):
-                tapped[t, i] += factor * w[k, i]
-        for i in range(ROWS):
-            tapped[t, i] *= q[i] - q0
-    for k in range(pull.shape[0]):
-        for i in range(ROWS):
-            pull[k, i] = 0.0
-        for t in range(tap.shape[0]):
-            factor = feed[k, t]
-            for i in range(ROWS):
-                pull[k, i] += factor * tapped[t, i]
+            tapped[t, i] = (q[i] - q0) * (tapped[t, i] + share * source[i])
 
 
 @jit_rows
@@ -221,7 +197,8 @@ def _evaluate(c: Any, s: Any, w: FloatArray, r: FloatArray, pull: FloatArray) ->
     system, level, sign, tapped = c.system, s.step[0].level, s.control[0].sign, c.work.tapped
     model = system.model
     mobile, q0 = model.mobile, system.q0[level]
-    _gap_voltage(model.k_gap, system.gap[level], w, r[SOURCE], r[X_GAP], r[U])
+    multiply(system.gap[level : level + 1], w, None, r[X_GAP : X_GAP + 1])
+    _gap_voltage(model.k_gap, r[SOURCE], r[X_GAP], r[U])
     if mobile:
         if not _solve_mobile(system, sign, r):
             return False
@@ -229,7 +206,9 @@ def _evaluate(c: Any, s: Any, w: FloatArray, r: FloatArray, pull: FloatArray) ->
         polynomial_rows(system.powers, system.lo, system.scale, r[U], sign, r[Q])
     else:
         _long_area(model.curve, sign, r)
-    _pull(system.tap[level], system.tap_k, system.feed[level], q0, r[SOURCE], r[Q], w, tapped, pull)
+    multiply(system.tap[level], w, None, tapped)
+    _leaked(system.tap_k, q0, r[SOURCE], r[Q], tapped)
+    multiply(system.feed[level], tapped, None, pull)
     if mobile:
         _push(system.push[level], q0, model.area0, r[SOURCE], r[Q], pull)
     return True
@@ -245,7 +224,7 @@ def evaluate_one(c: Any, s: Any) -> bool:
 def probe_one(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
     """The nonlinear term at other modes w than those of the step at hand, whose own rows stay as they are."""
     work = c.work
-    copy_to(work.spare_r, work.r)
+    copy_to(work.spare_r[SOURCE], work.r[SOURCE])
     copy_to(work.spare_r[GUESS], work.r[U])
     return _evaluate(c, s, w, work.spare_r, pull)
 

@@ -308,8 +308,8 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
         feed = np.column_stack([feed, system.push[0] / area0])
         kinks = np.append(kinks, -curve["steep"] / (q0 + curve["rest"]) ** 2)
         shape, by, missed_bend = area0 * q0 * shape, area0, missed * peak / q0
-    turn, moves = scene.shown.turn, np.zeros(system.k_shown.size)
-    columns, k, nodes = by * turn[:, None] * system.shown[0], turn * system.k_shown, by * system.node[0]
+    moves = np.zeros(system.k_shown.size)
+    columns, k, nodes = by * system.shown[0], system.k_shown, by * system.node[0]
     if problem.charge:
         column, stored, gain_of, feed_of, moved = _charge(system, stack)
         rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])
