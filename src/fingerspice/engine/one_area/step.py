@@ -192,12 +192,12 @@ def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
     step.converged, step.step_error = int(closed), math.inf
     if closed:
         exponential.carry(c, s, system.gap[level : level + 1], answer)
-        step.step_error, step.grown = _assess(c, s, pace.charge)
+        step.step_error, step.grown = _assess(c, s)
     return readout.GO_ON
 
 
 @jit_within
-def _assess(c: OneArea, s: LoopState, charge: bool) -> tuple[float, float]:
+def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
     """Error of a converged step: interpolation error between the nodes, residual of the iteration, earlier error.
 
     `places` takes the errors of the modes, that of the dense output included, `run` the whole error of the gap voltage.
@@ -229,8 +229,6 @@ def _assess(c: OneArea, s: LoopState, charge: bool) -> tuple[float, float]:
             magnified = max(magnified, factor)
         worst = max(worst, abs(factor * sums[1, p] + sums[0, p]))
         run[p + 1] = abs(factor * sums[2, p] + sums[0, p])
-    if not charge:
-        return worst, magnified
     # The charge contains the integral of A dU: the interpolation error of 1/A counts times the change of the source.
     area_first, area_second, area_third = between(r[Q])
     swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
