@@ -475,9 +475,14 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     f, energy = _recorded(waveform, t_stop) or _energies(waveform, t_stop, SKIN_BAND[1])
     if squares is None or f.size < 2:
         return None
-    # Gains between those of the grid are interpolated in log f, beyond its ends they are those of the ends.
-    place, known = np.log(np.maximum(f, SKIN_BAND[0])), np.log(_GRID)
-    right, held = (np.array([energy @ np.interp(place, known, row) for row in square]) for square in squares)
+
+    def at_lines() -> list[list[FloatArray]]:
+        # Interpolated in log f; beyond the ends of the grid they are those of the ends.
+        place = np.log(np.maximum(f, SKIN_BAND[0]))
+        return [[np.interp(place, np.log(_GRID), row) for row in square] for square in squares]
+
+    gains = shared(circuit, ("gains at", f.size, f[-1]), at_lines)
+    right, held = (np.array([energy @ row for row in rows]) for rows in gains)
     if not (right.size and np.all(right > 0.0) and np.all(np.isfinite(held / right))):
         return None
     return float(max(held / right - 1.0, key=abs))

@@ -18,7 +18,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.lanes.loops import MORE, hand_on, lead, show, span
@@ -168,8 +167,8 @@ class Block:
         self.xi = _scratch("xi", self.x.size)
         show(form.xi[None], self.x, self.first, self.count, 0, self.n + 1, self.kept, self.xi[None])
         self.xi[self.n + 1 :] = self.xi[self.n]
-        in_pieces = sliding_window_view(self.xi, self.count + 1)[:: self.count]
-        self.peaks = np.maximum(in_pieces.max(axis=1), -in_pieces.min(axis=1))
+        sizes = np.abs(self.xi)
+        self.peaks = np.maximum(sizes[:-1].reshape(PIECES, self.count).max(axis=1), sizes[self.count :: self.count])
         return True
 
     def end(self) -> FloatArray:
@@ -273,11 +272,10 @@ class Block:
     def _check(self, parts: int) -> _Window:
         """Follow a window of every piece by twice as many steps."""
         width, lanes = self.width, np.arange(PIECES)
-        off, z, at = np.empty(0), np.empty(0), lanes
-        windows = partial(sliding_window_view, window_shape=width + 1, axis=-1)
+        off, z, at, inside = np.empty(0), np.empty(0), lanes, np.arange(width + 1)
         for number, place in enumerate(self._windows()):
             first = np.maximum(place, 0)
-            coarse = windows(self.kept)[:, lanes, first]
+            coarse = self.kept[:, lanes[:, None], first[:, None] + inside]
             fine = np.empty(coarse.shape)
             fine[..., 0] = coarse[..., 0]
             self._span(self.first + first, width, 2 * parts, -1.0, fine)
@@ -289,9 +287,9 @@ class Block:
             in_xi, before = (np.abs(np.einsum("k,kij->ij", self.form.xi[1:], x)).max(axis=1) for x in (found, off))
             worse = in_xi > before
             off[:, worse], z[:, worse], at[worse] = found[:, worse], coarse[:, worse], first[worse]
-        at += self.first
-        took = sliding_window_view(self.h, width)[at].sum(axis=1) if self.own else np.full(PIECES, width * self.h[0])
-        return _Window(z, off, windows(self.x)[at], windows(self.xi)[at], took)
+        inside = (at + self.first)[:, None] + inside
+        took = self.h[inside[:, :-1]].sum(axis=1) if self.own else np.full(PIECES, width * self.h[0])
+        return _Window(z, off, self.x[inside], self.xi[inside], took)
 
     def _windows(self) -> list[IntArray]:
         """Where windows begin in each piece, -1 for none: at large moves of the source, under N at large |xi|, too."""
