@@ -54,6 +54,8 @@ POINTS = np.concatenate([_X, _BETWEEN])
 """Fractions of the step, shape (ROWS,)."""
 BETWEEN = np.ascontiguousarray(_lagrange(_BETWEEN, _X, BARYCENTRIC).T)
 """Interpolation from the nodes to the points between, shape (NODES, 3)."""
+LOBES = np.hstack([-BETWEEN.T, np.eye(3)])
+"""From values at the rows to those at the points between less the interpolated ones, shape (3, ROWS)."""
 DERIVATIVE = np.zeros((NODES, NODES))
 """Differentiation matrix: slope at each node, per step length, of the polynomial through values at the nodes."""
 for _i in range(NODES):

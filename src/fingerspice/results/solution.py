@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.waveform import Fundamental
 
 
-SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")  # Signals and means that have derivatives
+DERIVED = ("u_gap", "area", "f_el", "f_t", "friction")  # Signals and means that have derivatives
 MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
 
 

@@ -27,7 +27,7 @@ from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, lead, sum_
 from fingerspice.numerics.modes import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
-from fingerspice.results.solution import MEANS, SIGNALS, SampleGradient, Sensitivity, Solution
+from fingerspice.results.solution import DERIVED, MEANS, SampleGradient, Sensitivity, Solution
 from fingerspice.solve.planning import asked
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block, driving, ready
@@ -145,7 +145,7 @@ def sensitivities_of(
             said = f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period"
             raise InputError(f"{said}; allowed: other parameters, or a run from another start")
         runs = one.runs(1.0, run, solution)
-        by: dict[str, Any] = {name: one.by([getattr(other, name) for other in runs]) for name in (*SIGNALS, *MEANS)}
+        by: dict[str, Any] = {name: one.by([getattr(other, name) for other in runs]) for name in (*DERIVED, *MEANS)}
         for share in _CLOSER:
             # The area has a kink where the gap voltage is 0.
             signs = np.sign([_gaps(other) for other in runs])
@@ -153,7 +153,7 @@ def sensitivities_of(
             if not turned.any():
                 break
             runs = one.runs(share, run, solution)
-            for name in SIGNALS:
+            for name in DERIVED:
                 by[name][turned] = one.by([getattr(other, name)[turned] for other in runs], share)
         for name in MEANS if over_period else ():
             # The mean over a period that grows takes up what the signal is at its end.
@@ -165,9 +165,9 @@ def sensitivities_of(
 
 def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """The number's derivatives by u_gap, force and area at the outputs, shape (n_t,), and by the latter's means."""
-    allowed = ", ".join((*SIGNALS, *MEANS))
+    allowed = ", ".join((*DERIVED, *MEANS))
     refuse(not of, f"no signal is given; allowed: {allowed}")
-    by: dict[str, Any] = dict.fromkeys(SIGNALS, np.zeros(run.t.size)) | dict.fromkeys(MEANS, 0.0)
+    by: dict[str, Any] = dict.fromkeys(DERIVED, np.zeros(run.t.size)) | dict.fromkeys(MEANS, 0.0)
     for name, given in of.items():
         refuse(name not in by, f"unknown signal {name!r}; allowed: {allowed}")
         value = real_numbers(name, given, "numbers, derivatives by the signal")
@@ -211,7 +211,7 @@ class _Intervals:
         """Make the intervals, for the outputs that count."""
         run, wave, t0, t1 = self.run, self.wave, self.problem.t_start, self.problem.t_stop
         first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
-        more, self.slack = np.append(run.t[np.any([by[name] for name in SIGNALS], axis=0)], run.first), 1e-6 / wave.rate
+        more, self.slack = np.append(run.t[np.any([by[name] for name in DERIVED], axis=0)], run.first), 1e-6 / wave.rate
         more = more[np.abs((more - wave.start) * wave.rate % 1.0 - 0.5) < 0.5 - 1e-6]
         t = np.unique(np.concatenate([wave.start + np.arange(first, last + 1) / wave.rate, more]))
         t = np.concatenate([[t0], t[(t > t0 + self.slack) & (t < t1 - self.slack)], [t1]])

@@ -18,7 +18,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.results.outcome import SolveError
-from fingerspice.results.solution import MEANS, SIGNALS, Solution
+from fingerspice.results.solution import DERIVED, MEANS, Solution
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import LEAST_RTOL, REFUSED, batch, own_path
 from fingerspice.studies.batch.lockstep import lockstep_form, why_alone
@@ -47,19 +47,19 @@ class Scenes:
         gaps = len(circuit.by_device("GAP"))
         refuse(gaps != 1, f"the circuit has {gaps} GAPs; allowed: one")
         self.circuit, self.periodic, self.alone = circuit, bool(periodic), isinstance(outputs, str)
-        # Names out of `SIGNALS` and `MEANS`.
+        # Names out of `DERIVED` and `MEANS`.
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in self.outputs:
-            refuse(name not in MEANS + SIGNALS, f"unknown output {name!r}; allowed: {', '.join(MEANS + SIGNALS)}")
+            refuse(name not in MEANS + DERIVED, f"unknown output {name!r}; allowed: {', '.join(MEANS + DERIVED)}")
         require(bool(self.outputs), "outputs", "empty", "one or more names")
         require(len(set(self.outputs)) == len(self.outputs), "outputs", repr(self.outputs), "every name once")
-        signals = [name for name in self.outputs if name in SIGNALS]
+        signals = [name for name in self.outputs if name in DERIVED]
         # Times of the signals, s; none where there are only means
         self.t = np.zeros(0) if t is None else real_numbers("t", t, "numbers in s")
         if signals and (self.t.ndim != 1 or not self.t.size):
             raise InputError(f"{signals[0]} is asked for, and t is {t!r}; allowed: a row of times in s")
         if not signals and t is not None:
-            raise InputError(f"t is given, and no signal is asked for; allowed: outputs such as {', '.join(SIGNALS)}")
+            raise InputError(f"t is given, and no signal is asked for; allowed: outputs such as {', '.join(DERIVED)}")
         # End of every run, s; none where only the periodic state is asked for
         deck = None if circuit.tran is None else circuit.tran.stop
         self.t_stop = deck if t_stop is None else positive_number("t_stop", t_stop, "s")

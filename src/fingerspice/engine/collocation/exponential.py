@@ -15,7 +15,7 @@ from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
 from fingerspice.engine.collocation.readout import Modal, row_of
 from fingerspice.engine.many_areas.form import evaluate_many, probe_many
 from fingerspice.engine.one_area.rows import evaluate_one, largest_size, probe_one
-from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
+from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 from fingerspice.numerics.modes import copy_to
 
 
@@ -211,16 +211,14 @@ def _make_tables(tables: Tables, rates: FloatArray, level: int, h: float) -> int
 
 
 @jit_rows
-def between(values: FloatArray) -> tuple[float, float, float]:
-    """Interpolation error at the three points between nodes: values there less the polynomial through the nodes."""
-    first = 0.0
-    second = 0.0
-    third = 0.0
-    for j in range(NODES):
-        first += BETWEEN[j, 0] * values[j]
-        second += BETWEEN[j, 1] * values[j]
-        third += BETWEEN[j, 2] * values[j]
-    return values[FIRST] - first, values[SECOND] - second, values[THIRD] - third
+def between(lobes: FloatArray, values: FloatArray) -> tuple[float, float, float]:
+    """Interpolation error at the three points between nodes; for `lobes` see `Modal`."""
+    first, second, third = 0.0, 0.0, 0.0
+    for j in range(ROWS):
+        first += lobes[0, j] * values[j]
+        second += lobes[1, j] * values[j]
+        third += lobes[2, j] * values[j]
+    return first, second, third
 
 
 @jit_rows
@@ -321,7 +319,7 @@ def mode_error(
     iteration; and the `error` at the start as carried on. The first has the response at `rows`, which goes into `off`
     (4, m); it and the second are `magnified`. Returned is the interpolation error of the mode itself.
     """
-    pull, left, miss = between(x.pull[k]), x.spare[5, k], tables.miss[slot, k]
+    pull, left, miss = between(x.lobes, x.pull[k]), x.spare[5, k], tables.miss[slot, k]
     places, carried = x.places[k], x.carried[k]
     missed = largest((lin[0] + pull[0]) / MISS[0], (lin[1] + pull[1]) / MISS[1], (lin[2] + pull[2]) / MISS[2])
     left_over(tables.phi[slot, k], x.pull[k], x.used[k], left)
@@ -329,7 +327,7 @@ def mode_error(
     for p in range(4):
         off[p, k] = magnified * miss[rows[p]] * missed
         places[p + 1] = carried[p] + magnified * left[p] + off[p, k]
-    return between(x.w[k])
+    return between(x.lobes, x.w[k])
 
 
 @jit_rows

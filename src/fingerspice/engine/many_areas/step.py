@@ -325,7 +325,7 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
         step.grown = 1.0 / work.room[3].min()
     exponential.carry(c, s, form.gap, answer)
     error = errors.assess(c, s)
-    step.step_error = max(error, errors.charged(form.cell, u, work.areas[forms.AREA])) if pace.charge else error
+    step.step_error = max(error, errors.charged(form.cell, x, work.areas[forms.AREA])) if pace.charge else error
     return readout.GO_ON
 
 

@@ -12,7 +12,7 @@ from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.collocation.exponential import between
 from fingerspice.engine.collocation.readout import N_PLACES, Control, row_of
 from fingerspice.engine.one_area.model import Model
-from fingerspice.engine.one_area.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U
+from fingerspice.engine.one_area.rows import DQ, MORE, SCRATCH, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS, ROWS
 
 # The interpolation error of a rate changes its sign at every node, so that its integral is at most this fraction of its
@@ -35,12 +35,12 @@ def charge_step(c: Any, s: Any, z: FloatArray, current: FloatArray) -> None:
     fraction `theta` of the step counts.
     """
     system, work, step, control, level = c.system, c.work, s.step[0], s.control[0], s.step[0].level
-    model, r, w, pull, places = system.model, work.r, work.modal.w, work.modal.pull, work.modal.places
+    model, r, w, pull = system.model, work.r, work.modal.w, work.modal.pull
     h, theta, z0 = step.length, step.theta, s.y[-1]
     rates, gain, gap, slow_share = system.rates[level], system.gain[level], system.gap[level], system.slow[level]
     n = rates.size
     slow = model.slow
-    voltage, leak = np.empty(NODES), np.empty(NODES)
+    voltage, leak = r[SCRATCH], r[MORE]
     for j in range(NODES):
         dv = 0.0
         v = 0.0
@@ -75,7 +75,7 @@ def charge_step(c: Any, s: Any, z: FloatArray, current: FloatArray) -> None:
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control.peak_q = max(control.peak_q, abs(z[j]))
     kept = missed if theta < 1.0 else kept
-    _account(model, gap, slow_share, w, r, h, places, theta, missed, kept, control, s.collected)
+    _account(model, gap, slow_share, work, h, theta, missed, kept, control, s.collected)
 
 
 @jit
@@ -108,8 +108,8 @@ def integrate(integral: FloatArray, h: float, rate: FloatArray, out: FloatArray)
 
 @jit
 def _account(
-    model: Model, gap: FloatArray, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, places: FloatArray,
-    theta: float, missed: float, kept: float, control: Control, collected: FloatArray,
+    model: Model, gap: FloatArray, slow_share: FloatArray, work: Work, h: float, theta: float, missed: float,
+    kept: float, control: Control, collected: FloatArray,
 ) -> None:  # fmt: skip
     """Update the largest error of the charge, over the part of a step that counts, from the signed error of the modes.
 
@@ -120,16 +120,17 @@ def _account(
     the latter. `missed` is the error of the charge within the step by interpolation of its rate, and `kept` the part of
     it that lasts, C.
     """
-    n = gap.size
-    slow = model.slow
+    n, slow, r, w, places, spare = gap.size, model.slow, work.r, work.modal.w, work.modal.places, work.spare_r
     capacitance, g_area, g_total = slow[n + 1], slow[n + 2], slow[n + 3]
     last_area, last_voltage, last_gap, last_error, last_gap_error = 0.0, 0.0, 0.0, 0.0, 0.0
     last_theta = 0.0
     added = 0.0
     collected[1, 0] += kept * kept
-    brief, brief_gap = np.zeros(N_PLACES), np.zeros(N_PLACES)
+    brief, brief_gap = spare[0], spare[1]
+    for p in range(N_PLACES):
+        brief[p] = brief_gap[p] = 0.0
     for k in range(n):
-        first, second, third = between(w[k])
+        first, second, third = between(work.modal.lobes, w[k])
         for p, own in ((1, first), (2, second), (3, third)):
             brief[p] += slow_share[k] * own
             brief_gap[p] += gap[k] * own

@@ -141,17 +141,13 @@ def _take_level(c: OneArea, s: LoopState) -> None:
 
 @jit_rows
 def _linear(
-    gain: FloatArray, decay: FloatArray, phi: FloatArray, w0: FloatArray, source: FloatArray, base: FloatArray
+    gain: FloatArray, decay: FloatArray, w0: FloatArray, source: FloatArray, free: FloatArray, forcing: FloatArray
 ) -> None:
-    """Response of the modes to their start values and the source, with the area held at its reference."""
+    """Decay of the modes from their start values, and the source's forcing, with the area held at its reference."""
     for k in range(w0.size):
-        factor = gain[k]
-        start = w0[k]
         for i in range(ROWS):
-            total = 0.0
-            for j in range(NODES):
-                total += phi[k, j, i] * source[j]
-            base[k, i] = decay[k, i] * start + factor * total
+            free[k, i] = decay[k, i] * w0[k]
+            forcing[k, i] = gain[k] * source[i]
 
 
 @jit_within
@@ -169,7 +165,8 @@ def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
     if model.mobile:
         for i in range(ROWS):
             r[GUESS, i] = control.u_gap
-    _linear(system.gain[level], c.tables.decay[step.slot], c.tables.phi[step.slot], x.w0, r[SOURCE], x.base)
+    _linear(system.gain[level], c.tables.decay[step.slot], x.w0, r[SOURCE], x.w, x.used)
+    exponential.respond(x.used, c.tables.phi[step.slot], x.w, x.base)
     passes, closed, answer = exponential.converge(c, s, 0.3 * tol)
     counters[readout.NFEV] += passes * NODES
     step.wrong = step_control.first_wrong(u_rows, sign, tol) if model.coupled else 0
@@ -207,10 +204,10 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
     system, work, step, x, level = c.system, c.work, s.step[0], c.work.modal, s.step[0].level
     r, off, sums, run, gain, gap = work.r, work.off, work.sums, x.run[0], system.gain[level], system.gap[level]
     mobile, area0, places, n = system.model.mobile, system.model.area0, x.places, x.w0.size
-    off[0, n], off[1, n], off[2, n] = between(r[SOURCE])
+    off[0, n], off[1, n], off[2, n] = between(x.lobes, r[SOURCE])
     # Outputs are read from the polynomial through the gap voltages at the nodes: its interpolation error counts.
     sums[:] = 0.0
-    sums[0, 0], sums[0, 1], sums[0, 2] = between(r[U])
+    sums[0, 0], sums[0, 1], sums[0, 2] = between(x.lobes, r[U])
     for k in range(n):
         lin = (gain[k] * off[0, n], gain[k] * off[1, n], gain[k] * off[2, n])
         mode = exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
@@ -230,7 +227,7 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
         worst = max(worst, abs(factor * sums[1, p] + sums[0, p]))
         run[p + 1] = abs(factor * sums[2, p] + sums[0, p])
     # The charge contains the integral of A dU: the interpolation error of 1/A counts times the change of the source.
-    area_first, area_second, area_third = between(r[Q])
+    area_first, area_second, area_third = between(x.lobes, r[Q])
     swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
     missed = abs(largest(area_first / MISS[0], area_second / MISS[1], area_third / MISS[2]))
     return max(worst, swing * missed / r[Q, 0]), magnified
@@ -277,7 +274,7 @@ def _node_error(c: OneArea, level: int) -> float:
     Under `mobile` the voltages are the modes times 1/A: their error contains that of A, and the interpolation error of
     the product.
     """
-    system, r, w, places = c.system, c.work.r, c.work.modal.w, c.work.modal.places
+    system, r, w, places, lobes = c.system, c.work.r, c.work.modal.w, c.work.modal.places, c.work.modal.lobes
     node, k_node, gap, area0 = system.node[level], system.k_node, system.gap[level], system.model.area0
     if not system.model.mobile:
         return exponential.node_error(node, k_node[:, np.newaxis], places, c.work.off)
@@ -287,7 +284,7 @@ def _node_error(c: OneArea, level: int) -> float:
         for k in range(gap.size):
             own[k, p] = area0 * r[Q, readout.row_of(p)] * places[k, p]
     for k in range(gap.size):
-        missed[1], missed[2], missed[3] = between(w[k])
+        missed[1], missed[2], missed[3] = between(lobes, w[k])
         for p in range(N_PLACES):
             own[k, p] -= area0 * r[Q, readout.row_of(p)] * missed[p]
             moved[p] += gap[k] * own[k, p]
@@ -302,7 +299,7 @@ def _node_error(c: OneArea, level: int) -> float:
                 values[j] += node[i, k] * w[k, j]
             values[j] *= area0 * r[Q, j]
             values[j] += k_node[i] * r[SOURCE, j]
-        missed[1], missed[2], missed[3] = between(values)
+        missed[1], missed[2], missed[3] = between(lobes, values)
         for p in range(N_PLACES):
             total = missed[p]
             for k in range(gap.size):
