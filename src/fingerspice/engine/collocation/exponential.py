@@ -15,7 +15,7 @@ from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
 from fingerspice.engine.collocation.readout import Modal, row_of
 from fingerspice.engine.many_areas.form import evaluate_many, probe_many
 from fingerspice.engine.one_area.rows import evaluate_one, largest_size, probe_one
-from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
+from fingerspice.numerics.lobatto import END, FIRST, LOBES, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 from fingerspice.numerics.modes import copy_to
 
 
@@ -163,6 +163,7 @@ class Tables(NamedTuple):
     decay: FloatArray
     phi: FloatArray
     miss: FloatArray
+    lobes: FloatArray  # A copy of `lobatto.LOBES`: the compiler makes no vectors of products with constants
 
 
 def new_tables(n: int) -> Tables:
@@ -175,6 +176,7 @@ def new_tables(n: int) -> Tables:
         np.zeros((slots, n, ROWS)),
         np.zeros((slots, n, NODES, ROWS)),
         np.zeros((slots, n, ROWS)),
+        LOBES.copy(),
     )
 
 
@@ -212,7 +214,7 @@ def _make_tables(tables: Tables, rates: FloatArray, level: int, h: float) -> int
 
 @jit_rows
 def between(lobes: FloatArray, values: FloatArray) -> tuple[float, float, float]:
-    """Interpolation error at the three points between nodes; for `lobes` see `Modal`."""
+    """Interpolation error at the three points between nodes; for `lobes` see `Tables`."""
     first, second, third = 0.0, 0.0, 0.0
     for j in range(ROWS):
         first += lobes[0, j] * values[j]
@@ -224,10 +226,7 @@ def between(lobes: FloatArray, values: FloatArray) -> tuple[float, float, float]
 @jit_rows
 def left_over(phi: FloatArray, pull: FloatArray, used: FloatArray, at: FloatArray) -> None:
     """Response of a mode to the residual of the iteration, at the points between nodes and the end, into `at` (4,)."""
-    first = 0.0
-    second = 0.0
-    third = 0.0
-    end = 0.0
+    first, second, third, end = 0.0, 0.0, 0.0, 0.0
     for j in range(NODES):
         left = pull[j] - used[j]
         first += phi[j, FIRST] * left
@@ -319,7 +318,7 @@ def mode_error(
     iteration; and the `error` at the start as carried on. The first has the response at `rows`, which goes into `off`
     (4, m); it and the second are `magnified`. Returned is the interpolation error of the mode itself.
     """
-    pull, left, miss = between(x.lobes, x.pull[k]), x.spare[5, k], tables.miss[slot, k]
+    pull, left, miss = between(tables.lobes, x.pull[k]), x.spare[5, k], tables.miss[slot, k]
     places, carried = x.places[k], x.carried[k]
     missed = largest((lin[0] + pull[0]) / MISS[0], (lin[1] + pull[1]) / MISS[1], (lin[2] + pull[2]) / MISS[2])
     left_over(tables.phi[slot, k], x.pull[k], x.used[k], left)
@@ -327,7 +326,7 @@ def mode_error(
     for p in range(4):
         off[p, k] = magnified * miss[rows[p]] * missed
         places[p + 1] = carried[p] + magnified * left[p] + off[p, k]
-    return between(x.lobes, x.w[k])
+    return between(tables.lobes, x.w[k])
 
 
 @jit_rows

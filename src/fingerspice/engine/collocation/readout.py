@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
 from fingerspice.numerics.chebyshev import to_powers
-from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, LOBES, NODES, POINTS, ROWS, TO_SERIES, multiply
+from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES, multiply
 from fingerspice.numerics.modes import copy_to
 
 CONTROL = np.dtype([
@@ -126,7 +126,6 @@ class Modal(NamedTuple):
     # u, guess (n_area, ROWS): Gap voltages now and an iteration before, V
     u: FloatArray
     guess: FloatArray
-    lobes: FloatArray  # A copy of `lobatto.LOBES`: the compiler makes no vectors of products with constants
 
 
 def new_modal(m: int, columns: int, u: FloatArray, guess: FloatArray) -> Modal:
@@ -135,7 +134,6 @@ def new_modal(m: int, columns: int, u: FloatArray, guess: FloatArray) -> Modal:
     return Modal(
         z(rows), z(rows), z(rows), z(rows), z(rows), z(rows), z((6, m, ROWS)), z(m), z(m), z((m, N_PLACES)),
         z((m, N_PLACES - 1)), z((len(u), N_PLACES)), z(wide), z(wide), z((2, WRITTEN_AT_ONCE)), z(NODES), u, guess,
-        LOBES.copy(),
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.collocation.exponential import between, largest, mode_error
-from fingerspice.engine.collocation.readout import N_PLACES, Control, Modal, row_of
+from fingerspice.engine.collocation.readout import N_PLACES, Control, row_of
 from fingerspice.engine.collocation.step_control import first_wrong
 from fingerspice.engine.many_areas import form as forms
 from fingerspice.engine.many_areas.form import Form, Work
@@ -93,9 +93,9 @@ def assess(c: Any, s: Any) -> float:
     w, pull, places, run, gap, rates = x.w, x.pull, x.places, x.run, form.gap, form.rates
     n, m = gap.shape[1], w.shape[0]
     for j in range(work.s.shape[0]):
-        off[0, m + j], off[1, m + j], off[2, m + j] = between(x.lobes, work.s[j])
+        off[0, m + j], off[1, m + j], off[2, m + j] = between(c.tables.lobes, work.s[j])
     for k in range(m):
-        mode = mode_error(x, k, between(x.lobes, lin[k]), c.tables, step.slot, _WORST, magnified, error[k], off)
+        mode = mode_error(x, k, between(c.tables.lobes, lin[k]), c.tables, step.slot, _WORST, magnified, error[k], off)
         # The slope of the mode at the start shows such a decay: it differs by the decay's size times its rate.
         fall = 0.0
         for j in range(NODES):
@@ -120,13 +120,13 @@ def assess(c: Any, s: Any) -> float:
 
 
 @jit
-def charged(cell: IntArray, x: Modal, area: FloatArray) -> float:
+def charged(cell: IntArray, u: FloatArray, area: FloatArray, lobes: FloatArray) -> float:
     """Interpolation error of the areas as a voltage, V: it enters the charge through the integral of A du."""
     worst = 0.0
     for a in range(cell.size):
         if cell[a] >= 0:
-            first, second, third = between(x.lobes, area[a])
-            swing = 0.3 * abs(x.u[a, END] - x.u[a, 0])
+            first, second, third = between(lobes, area[a])
+            swing = 0.3 * abs(u[a, END] - u[a, 0])
             worst = max(worst, swing * abs(largest(first, second, third)) / area[a, 0])
     return worst
 
@@ -231,8 +231,9 @@ def _charge_rows(
 
 @jit
 def charge_error(
-    form: Form, work: Work, h: float, theta: float, z: FloatArray, collected: FloatArray, control: Control
-) -> None:
+    form: Form, work: Work, lobes: FloatArray, h: float, theta: float, z: FloatArray, collected: FloatArray,
+    control: Control,
+) -> None:  # fmt: skip
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
 
     With du the error of a cell's voltage and dA that of its area, the error of a charge has a stored part, which goes
@@ -254,10 +255,10 @@ def charge_error(
     _cell_errors(form, brief, areas[forms.SLOPE], cell_slips[1])
     off_briefly, mobile = np.empty(N_PLACES), form.mobile
     for source in range(form.stored.shape[0]):
-        first, second, third = between(work.modal.lobes, z[source])
+        first, second, third = between(lobes, z[source])
         swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
         if not mobile:
-            swing, end = _area_missed(form, source, work)
+            swing, end = _area_missed(form, source, work, lobes)
         for p in range(1, N_PLACES - 1):
             leak = _part(form, source, p, form.lost, form.g, True, brief, cell_slips[1], u, more)
             lobe = max(lobe, _HALF_LOBE * h * abs(leak))
@@ -338,7 +339,7 @@ def _turned(form: Form, source: int, p: int, off: FloatArray, u: FloatArray, are
 
 
 @jit
-def _area_missed(form: Form, source: int, work: Work) -> tuple[float, float]:
+def _area_missed(form: Form, source: int, work: Work, lobes: FloatArray) -> tuple[float, float]:
     """Errors of the integral of c A u' by the interpolation of the areas, within a step and at its end, C.
 
     Within the step the error is the lobe between two nodes. At the end the quadrature rule has twice the order, so that
@@ -347,7 +348,7 @@ def _area_missed(form: Form, source: int, work: Work) -> tuple[float, float]:
     way, end, u, area = 0.0, 0.0, work.cells[forms.CELL_U], work.areas[forms.AREA]
     for b in range(form.c.size):
         a = form.home[b]
-        first, second, third = between(work.modal.lobes, area[a])
+        first, second, third = between(lobes, area[a])
         worst = max(abs(first), abs(second), abs(third))
         total = 0.0
         for i in range(1, NODES):

@@ -324,8 +324,8 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     if form.mobile:
         step.grown = 1.0 / work.room[3].min()
     exponential.carry(c, s, form.gap, answer)
-    error = errors.assess(c, s)
-    step.step_error = max(error, errors.charged(form.cell, x, work.areas[forms.AREA])) if pace.charge else error
+    error, area = errors.assess(c, s), work.areas[forms.AREA]
+    step.step_error = max(error, errors.charged(form.cell, u, area, c.tables.lobes)) if pace.charge else error
     return readout.GO_ON
 
 
@@ -433,8 +433,9 @@ def _write(c: ManyAreas, pace: Pace, s: LoopState, t: float) -> None:
     form, work, step, values = forms.form_of(c, s), c.work, s.step[0], c.work.modal.values
     first_z, n_y = s.y.size - c.s_before.size, s.y.size
     if pace.charge:
-        errors.step_charges(form, work, step.length, c.integral, c.sign, values[first_z:n_y], values[n_y:])
-        errors.charge_error(form, work, step.length, step.theta, values[first_z:n_y], s.collected, s.control[0])
+        z, h = values[first_z:n_y], step.length
+        errors.step_charges(form, work, h, c.integral, c.sign, z, values[n_y:])
+        errors.charge_error(form, work, c.tables.lobes, h, step.theta, z, s.collected, s.control[0])
     for e in range(c.s_before.size):
         work.gained[e] = readout.at(values[first_z + e], work.modal.basis) if pace.charge else 0.0
     if s.step[0].in_jump > 0 or not readout.is_wanted(s, step.t_new):

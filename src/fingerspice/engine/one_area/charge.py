@@ -75,7 +75,7 @@ def charge_step(c: Any, s: Any, z: FloatArray, current: FloatArray) -> None:
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control.peak_q = max(control.peak_q, abs(z[j]))
     kept = missed if theta < 1.0 else kept
-    _account(model, gap, slow_share, work, h, theta, missed, kept, control, s.collected)
+    _account(model, gap, slow_share, work, c.tables.lobes, h, theta, missed, kept, control, s.collected)
 
 
 @jit
@@ -108,8 +108,8 @@ def integrate(integral: FloatArray, h: float, rate: FloatArray, out: FloatArray)
 
 @jit
 def _account(
-    model: Model, gap: FloatArray, slow_share: FloatArray, work: Work, h: float, theta: float, missed: float,
-    kept: float, control: Control, collected: FloatArray,
+    model: Model, gap: FloatArray, slow_share: FloatArray, work: Work, lobes: FloatArray, h: float, theta: float,
+    missed: float, kept: float, control: Control, collected: FloatArray,
 ) -> None:  # fmt: skip
     """Update the largest error of the charge, over the part of a step that counts, from the signed error of the modes.
 
@@ -130,7 +130,7 @@ def _account(
     for p in range(N_PLACES):
         brief[p] = brief_gap[p] = 0.0
     for k in range(n):
-        first, second, third = between(work.modal.lobes, w[k])
+        first, second, third = between(lobes, w[k])
         for p, own in ((1, first), (2, second), (3, third)):
             brief[p] += slow_share[k] * own
             brief_gap[p] += gap[k] * own

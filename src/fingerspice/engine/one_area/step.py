@@ -204,10 +204,10 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
     system, work, step, x, level = c.system, c.work, s.step[0], c.work.modal, s.step[0].level
     r, off, sums, run, gain, gap = work.r, work.off, work.sums, x.run[0], system.gain[level], system.gap[level]
     mobile, area0, places, n = system.model.mobile, system.model.area0, x.places, x.w0.size
-    off[0, n], off[1, n], off[2, n] = between(x.lobes, r[SOURCE])
+    off[0, n], off[1, n], off[2, n] = between(c.tables.lobes, r[SOURCE])
     # Outputs are read from the polynomial through the gap voltages at the nodes: its interpolation error counts.
     sums[:] = 0.0
-    sums[0, 0], sums[0, 1], sums[0, 2] = between(x.lobes, r[U])
+    sums[0, 0], sums[0, 1], sums[0, 2] = between(c.tables.lobes, r[U])
     for k in range(n):
         lin = (gain[k] * off[0, n], gain[k] * off[1, n], gain[k] * off[2, n])
         mode = exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
@@ -227,7 +227,7 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
         worst = max(worst, abs(factor * sums[1, p] + sums[0, p]))
         run[p + 1] = abs(factor * sums[2, p] + sums[0, p])
     # The charge contains the integral of A dU: the interpolation error of 1/A counts times the change of the source.
-    area_first, area_second, area_third = between(x.lobes, r[Q])
+    area_first, area_second, area_third = between(c.tables.lobes, r[Q])
     swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
     missed = abs(largest(area_first / MISS[0], area_second / MISS[1], area_third / MISS[2]))
     return max(worst, swing * missed / r[Q, 0]), magnified
@@ -274,7 +274,7 @@ def _node_error(c: OneArea, level: int) -> float:
     Under `mobile` the voltages are the modes times 1/A: their error contains that of A, and the interpolation error of
     the product.
     """
-    system, r, w, places, lobes = c.system, c.work.r, c.work.modal.w, c.work.modal.places, c.work.modal.lobes
+    system, r, w, places, lobes = c.system, c.work.r, c.work.modal.w, c.work.modal.places, c.tables.lobes
     node, k_node, gap, area0 = system.node[level], system.k_node, system.gap[level], system.model.area0
     if not system.model.mobile:
         return exponential.node_error(node, k_node[:, np.newaxis], places, c.work.off)
