@@ -24,7 +24,7 @@ from fingerspice.engine.many_areas.coupling import STIFF, take_coupling
 from fingerspice.engine.many_areas.form import Form
 from fingerspice.engine.one_area import charge, rows
 from fingerspice.engine.one_area.model import Model
-from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import END, FIRST, LOBES, MISS, NODES, POINTS, ROWS
 from fingerspice.numerics.modes import diagonalise
 
 PLACES = np.array([0, FIRST, FIRST + 1, FIRST + 2, END])
@@ -152,19 +152,19 @@ def engine_account(
     """
     u, _, area = step.at(POINTS, 0.0)
     if missed is None:
-        w = np.array([m(POINTS) for m in step.modes])
-        places = np.array([e(POINTS[PLACES]) for e in step.errors])
+        w, places = np.array([m(POINTS) for m in step.modes]), np.array([e(POINTS[PLACES]) for e in step.errors])
     else:
         w = np.array([np.full(ROWS, m(0.0)) for m in step.modes])
         w[:, FIRST:] += missed
         places = np.zeros((2, N_PLACES))
         places[:, 1 : N_PLACES - 1] = missed
-    r = np.zeros((rows.N_FLAT, ROWS))
+    work = rows.new_stack_work(2)
+    r, work.modal.w[:], work.modal.places[:] = work.r, w, places
     r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
     r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
     control, collected = np.zeros(1, readout.CONTROL)[0], np.array([[before], [0.0]])
     control["last_q"] = 1.0 / last_area
-    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, kept, control, collected)
+    charge._account(step.model, step.gap, step.slow, work, LOBES, H, 1.0, 0.0, kept, control, collected)
     return float(collected[0, 0]), float(control["error_q"])
 
 
@@ -316,7 +316,7 @@ def engine_charge(
     work.areas[blocks.AREA], work.areas[blocks.MORE] = area, area - A0
     work.areas[blocks.SLOPE] = 0.0 if step.slow else slope_at(u[0])
     work.cells[blocks.CELL_U], work.modal.places[:], work.off[:, : len(places)] = u, places, missed
-    many_charge.charge_error(form, work, H, theta, z, collected, control)
+    many_charge.charge_error(form, work, LOBES, H, theta, z, collected, control)
     return collected[:, 0], control
 
 
