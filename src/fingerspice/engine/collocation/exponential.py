@@ -20,6 +20,14 @@ from fingerspice.numerics.modes import copy_to
 
 
 @jit_rows
+def free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
+    """Decay of the modes from their values at the start of a step."""
+    for k in range(w0.size):
+        for i in range(ROWS):
+            out[k, i] = decay[k, i] * w0[k]
+
+
+@jit_rows
 def respond(forcing: FloatArray, phi: FloatArray, base: FloatArray, w: FloatArray) -> None:
     """w = base + response to `forcing` (n, ROWS), of which only the values at the nodes are used."""
     for k in range(w.shape[0]):

@@ -385,11 +385,3 @@ def ramp_rows(t: float, h: float, before: FloatArray, after: FloatArray, s: Floa
         for i in range(ROWS):
             ds[e, i] = after[e] - before[e]
             s[e, i] = before[e] + (t + POINTS[i] * h) * ds[e, i]
-
-
-@jit_rows
-def free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
-    """Decay of the modes from their values at the start of a step."""
-    for k in range(w0.size):
-        for i in range(ROWS):
-            out[k, i] = decay[k, i] * w0[k]

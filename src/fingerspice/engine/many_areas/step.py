@@ -310,7 +310,7 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     forms.follow_sources(form, work)
     forms.clear(x.guess)
     forms.clear(work.cells[forms.RHO])
-    forms.free(c.tables.decay[step.slot], x.w0, x.w)
+    exponential.free(c.tables.decay[step.slot], x.w0, x.w)
     exponential.respond(work.lin, c.tables.phi[step.slot], x.w, x.base)
     passes, closed, answer = exponential.converge(c, s, 0.3 * tol)
     s.counters[readout.NFEV] += passes * NODES

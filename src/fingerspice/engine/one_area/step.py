@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.collocation import exponential, readout, step_control
 from fingerspice.engine.collocation.exponential import Tables, between, largest
 from fingerspice.engine.collocation.readout import N_PLACES, LoopState
@@ -25,7 +25,7 @@ from fingerspice.engine.one_area.charge import charge_step
 from fingerspice.engine.one_area.model import dot, turns_at_zero
 from fingerspice.engine.one_area.rows import DQ, GUESS, SCRATCH, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.one_area.system import System
-from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS, SECOND, THIRD
+from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS, SECOND, THIRD, multiply
 from fingerspice.numerics.modes import apply
 
 # A gap voltage below this fraction of the one at the next node counts as 0.
@@ -139,17 +139,6 @@ def _take_level(c: OneArea, s: LoopState) -> None:
     step.level, s.step[0].tabled = now, 0.0
 
 
-@jit_rows
-def _linear(
-    gain: FloatArray, decay: FloatArray, w0: FloatArray, source: FloatArray, free: FloatArray, forcing: FloatArray
-) -> None:
-    """Decay of the modes from their start values, and the source's forcing, with the area held at its reference."""
-    for k in range(w0.size):
-        for i in range(ROWS):
-            free[k, i] = decay[k, i] * w0[k]
-            forcing[k, i] = gain[k] * source[i]
-
-
 @jit_within
 def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
@@ -165,7 +154,9 @@ def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
     if model.mobile:
         for i in range(ROWS):
             r[GUESS, i] = control.u_gap
-    _linear(system.gain[level], c.tables.decay[step.slot], x.w0, r[SOURCE], x.w, x.used)
+    # With the area held at its reference: the modes' decay, and their response to the source.
+    exponential.free(c.tables.decay[step.slot], x.w0, x.w)
+    multiply(system.gain[level][:, np.newaxis], r[SOURCE : SOURCE + 1], None, x.used)
     exponential.respond(x.used, c.tables.phi[step.slot], x.w, x.base)
     passes, closed, answer = exponential.converge(c, s, 0.3 * tol)
     counters[readout.NFEV] += passes * NODES
