@@ -19,11 +19,11 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along.
-ALL_LINES = 35_972
+ALL_LINES = 35_967
 ALL_FILES = 129
 PACKAGE_LINES = {
-    "base": 1_034, "circuit": 2_042, "cli": 1_471, "engine": 7_833, "explorer": 1_230, "netlist": 2_072,
-    "numerics": 1_199, "physics": 453, "plots": 1_223, "results": 2_506, "sets": 365, "solve": 5_685,
+    "base": 1_034, "circuit": 2_042, "cli": 1_471, "engine": 7_829, "explorer": 1_230, "netlist": 2_072,
+    "numerics": 1_198, "physics": 453, "plots": 1_223, "results": 2_506, "sets": 365, "solve": 5_685,
     "studies": 6_068, "torch": 386, "waveforms": 2_256,
 }  # fmt: skip
 

@@ -27,9 +27,9 @@ Array = TypeVar("Array", bound=np.ndarray[Any, Any])
 
 
 def aligned(shapes: Iterable[tuple[int, ...]]) -> list[FloatArray]:
-    """Arrays, not filled, that begin at multiples of 64 bytes, as no vector should cross the lines of the cache."""
+    """Zeros that begin at multiples of 64 bytes, as no vector should cross the lines of the cache."""
     whole = [(shape, math.prod(shape)) for shape in shapes]
-    raw = np.empty(8 + sum(size + 8 for _, size in whole))
+    raw = np.zeros(8 + sum(size + 8 for _, size in whole))
     at, out = -(raw.ctypes.data // raw.itemsize) % 8, []
     for shape, size in whole:
         out.append(raw[at : at + size].reshape(shape))

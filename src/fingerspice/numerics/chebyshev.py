@@ -138,8 +138,7 @@ def evaluate_array(c: FloatArray, x: FloatArray, lo: float, scale: float, out: F
 @jit_rows
 def _horner(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
     x, out = borrow(x), borrow(out)
-    at = np.zeros(_BLOCK)
-    value = np.zeros(_BLOCK)
+    at, value = np.zeros(_BLOCK), np.zeros(_BLOCK)
     for first in range(0, x.size, _BLOCK):
         count = min(_BLOCK, x.size - first)
         # Views: an index with a sum in it keeps a loop from becoming vectors.
@@ -147,16 +146,16 @@ def _horner(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArr
         for i in range(count):
             at[i] = (abs(here[i]) - lo) * scale - 1.0
         k = c.size - 1
-        top = c[k]
-        for i in range(_BLOCK):
-            value[i] = top
-        # Four steps for each pass through memory.
-        while k >= 4:
+        value[:] = c[k]
+        # Eight steps for each pass through memory.
+        while k >= 8:
             c0, c1, c2, c3 = c[k - 1], c[k - 2], c[k - 3], c[k - 4]
+            c4, c5, c6, c7 = c[k - 5], c[k - 6], c[k - 7], c[k - 8]
             for i in range(_BLOCK):
                 step = at[i]
-                value[i] = (((value[i] * step + c0) * step + c1) * step + c2) * step + c3
-            k -= 4
+                half = (((value[i] * step + c0) * step + c1) * step + c2) * step + c3
+                value[i] = (((half * step + c4) * step + c5) * step + c6) * step + c7
+            k -= 8
         while k > 0:
             k -= 1
             c0 = c[k]

@@ -79,8 +79,7 @@ def _seal(values: dict[Any, Any]) -> None:
 def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray | None:
     """Signals (n_t,) of several elements as a table, that of one as it is; None of no element."""
     if len(columns) < 2:
-        # A view of a run's rows is copied, so that it does not seal them.
-        return read_only(np.array(columns[0])) if len(columns) else None
+        return read_only(np.ascontiguousarray(columns[0])) if len(columns) else None
     return read_only(np.column_stack([*columns]))
 
 

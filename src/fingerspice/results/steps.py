@@ -57,9 +57,10 @@ class Recorder:
 
     def repeat(self, since: int, periods: int, period: float) -> None:
         """Let the parts from number `since` on also represent the `periods` periods that follow them."""
-        again = np.array([[periods], [period]])
         for times, values in self.parts[since:] if periods > 0 else ():
-            self.parts.append((np.concatenate([times[:4], again.repeat(len(values), axis=1)]), values))
+            later = times.copy()
+            later[4], later[5] = periods, period
+            self.parts.append((later, values))
 
     def finish(self, first: float, make: Make) -> Recorded | None:
         """The run recorded since `first` (s); None where nothing, or too much, was recorded."""

@@ -122,7 +122,9 @@ class Integration(ABC):
     def __init__(self, problem: Problem) -> None:
         self.problem, self.net = problem, problem.scene.net
         # What is written on the way: also the outputs at the end, if no source may jump there.
-        left = problem.left if after_the_end(problem) else problem.left | (problem.t_out == problem.t_stop)
+        left, last = problem.left, int(problem.t_out.searchsorted(problem.t_stop))
+        if last < left.size and after_the_end(problem) is None:
+            left = np.concatenate([left[:last], np.ones(left.size - last, bool)])
         self.t_out, self.left = read_only(problem.t_out), read_only(left)
         self.n, n_s = map(int, self.net.b.shape)
         # The state reached, as in `State`.

@@ -207,9 +207,8 @@ def run_problem(
     run, name = integrated(problem, plan, rtol, method, progress)
     run.stats["wall_s"] = time.perf_counter() - begin  # type: ignore[assignment]
     # Report the times asked for, not the breakpoints to which `at_breakpoints` has moved some of them.
-    t = run.t.copy()
-    if run.status is Status.SUCCESS:
-        t = t_out if run.t.size == t_out.size else np.concatenate([t_out[: run.t.size], run.t[t_out.size :]])
+    t = t_out if run.t.size == t_out.size else np.concatenate([t_out[: run.t.size], run.t[t_out.size :]])
+    t = t if run.status is Status.SUCCESS else run.t
     return solution_of(problem, plan, run, run.record(problem), t, rtol, name)
 
 

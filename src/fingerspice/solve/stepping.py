@@ -236,16 +236,20 @@ class Stepping(Integration):
         """Repeat the kept period in place of all whole periods that follow."""
         found, n_s, period, stop = self.looks.values, self.s_before.size, self.period, self.problem.t_stop
         periods, off, owed = int(found[loop.LEFT]), float(found[loop.DISTANCE]), float(found[loop.REMAINING])
-        charge, collected = self.before
-        drift = self.y[-n_s:] - charge
         drifts = np.zeros(len(self.out))
-        if self.problem.charge:
+        if self.pace.charge:
+            # Every period repeats the charge of the integrated one, and its error.
+            charge, collected = self.before
+            drift, (missed, spread) = self.y[-n_s:] - charge, self.collected - collected
             drifts[-2 * n_s : -n_s] = drift
+            self.y[-n_s:] += periods * drift
+            self.collected[0] += periods * missed
+            added = periods * float((np.abs(missed) + np.sqrt(spread)).max())
+            self.control["error_q"] += added + self.capacitance * owed
         self.counters[readout.OUTPUT] = readout.repeat(
             self.kept, int(self.counters[readout.KEPT]), period, periods, drifts, int(self.counters[readout.OUTPUT]),
             self.outputs,
         )  # fmt: skip
-        self.y[-n_s:] += periods * drift
         self.recorder.drain(self.counters)
         self.recorder.repeat(self.kept_from, periods, period)
         # The end of a period may be the end of the run but for the rounding of both.
@@ -253,16 +257,11 @@ class Stepping(Integration):
         self.control["t"] = stop if abs(stop - reached) <= same_time(stop) else reached
         self.branch[:, 0] += periods * period
         self.control["branch_start"] += periods * period
-        # What the voltages (V), and the charge over the capacitance (V), are still off the periodic state; every period
-        # repeats the charge error of the integrated one.
-        self.peaks[:, readout.ERROR_U] += off
-        u = self.peaks[:, readout.PEAK_U]
-        self.peaks[:, readout.ERROR_F] += off * 2.0 * self.peaks[:, readout.PEAK_F] / np.where(u > 0.0, u, np.inf)
-        missed, spread = self.collected - collected
-        self.collected[0] += periods * missed
-        if self.pace.charge:
-            added = periods * float((np.abs(missed) + np.sqrt(spread)).max())
-            self.control["error_q"] += added + self.capacitance * owed
+        # What the voltages, and the charge over the capacitance, are still off the periodic state: `off` and `owed`, V.
+        for peak in self.peaks:
+            peak[readout.ERROR_U] += off
+            if peak[readout.PEAK_U] > 0.0:
+                peak[readout.ERROR_F] += off * 2.0 * peak[readout.PEAK_F] / peak[readout.PEAK_U]
         self.repeated += periods
 
     def recorded(self) -> Recorded | None:

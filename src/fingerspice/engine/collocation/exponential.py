@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray, IntArray, aligned
 from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
 from fingerspice.engine.collocation.readout import Modal, row_of
 from fingerspice.engine.many_areas.form import evaluate_many, probe_many
@@ -177,15 +177,10 @@ class Tables(NamedTuple):
 def new_tables(n: int) -> Tables:
     """Empty tables for n modes."""
     slots = max(FEWEST_SLOTS, min(N_SLOTS, MOST_ENTRIES // max(n, 1)))
-    return Tables(
-        np.zeros(slots),
-        np.full(slots, -1),
-        np.zeros(1, np.int64),
-        np.zeros((slots, n, ROWS)),
-        np.zeros((slots, n, NODES, ROWS)),
-        np.zeros((slots, n, ROWS)),
-        LOBES.copy(),
-    )
+    shapes = (slots,), (slots, n, ROWS), (slots, n, NODES, ROWS), (slots, n, ROWS), LOBES.shape
+    h, decay, phi, miss, lobes = aligned(shapes)
+    lobes[:] = LOBES
+    return Tables(h, np.full(slots, -1), np.zeros(1, np.int64), decay, phi, miss, lobes)
 
 
 @jit_within

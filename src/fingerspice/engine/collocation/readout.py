@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray, IntArray, aligned
 from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
 from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES, multiply
@@ -130,11 +130,12 @@ class Modal(NamedTuple):
 
 def new_modal(m: int, columns: int, u: FloatArray, guess: FloatArray) -> Modal:
     """Arrays for m modes and so many output columns, beside those of the gap voltages."""
-    z, rows, wide = np.zeros, (m, ROWS), (columns, ROWS)
-    return Modal(
-        z(rows), z(rows), z(rows), z(rows), z(rows), z(rows), z((6, m, ROWS)), z(m), z(m), z((m, N_PLACES)),
-        z((m, N_PLACES - 1)), z((len(u), N_PLACES)), z(wide), z(wide), z((2, WRITTEN_AT_ONCE)), z(NODES), u, guess,
+    rows, wide = (m, ROWS), (columns, ROWS)
+    shapes = (
+        rows, rows, rows, rows, rows, rows, (6, m, ROWS), (m,), (m,), (m, N_PLACES), (m, N_PLACES - 1),
+        (len(u), N_PLACES), wide, wide, (2, WRITTEN_AT_ONCE), (NODES,),
     )  # fmt: skip
+    return Modal._make((*aligned(shapes), u, guess))
 
 
 @jit_rows

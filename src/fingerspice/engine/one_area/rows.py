@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, aligned
 from fingerspice.base.compiled import jit, jit_fused, jit_rows, jit_within
 from fingerspice.engine.collocation.readout import N_PLACES, Modal, new_modal
 from fingerspice.engine.network import term_at
@@ -37,9 +37,9 @@ class Work(NamedTuple):
 
 def new_stack_work(n: int) -> Work:
     """Work arrays for n modes."""
-    r = np.zeros((N_FLAT, ROWS))
-    modal = new_modal(n, n + 2, r[U : U + 1], r[GUESS : GUESS + 1])
-    return Work(modal, r, np.zeros((n + 1, ROWS)), np.zeros((N_PLACES, n + 1)), np.zeros((3, 4)), np.zeros_like(r))
+    own = (N_FLAT, ROWS)
+    r, *others = aligned((own, (n + 1, ROWS), (N_PLACES, n + 1), (3, 4), own))
+    return Work(new_modal(n, n + 2, r[U : U + 1], r[GUESS : GUESS + 1]), r, *others)
 
 
 _PI_HIGH = 3.141592653589793
