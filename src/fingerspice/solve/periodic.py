@@ -215,17 +215,17 @@ class Search(Period):
         self.top = 0.0
         # A conserved charge is no unknown. If half a period is used, all voltages change sign: such a charge is 0.
         self.free = ~self.neutral if self.parts == 1 else np.ones(self.rates.size, bool)
-        self.slow = np.arange(self.rates.size) >= self.n
         self.fingers = list(problem.network.fingers)
         self.z = self._guess()
         largest = float(np.abs(self.voltages(self.z)).max(initial=0.0))
         self.scale = max(problem.scene.u_peak, largest) or GUESS
-        self.solver = self._inverse(np.diag(self.turned * np.exp(-self.rates * self.span)))
+        self.decay = self.turned * np.exp(-self.rates * self.span)
+        self._solve_by(np.diag(1.0 / np.where(self.free, 1.0 - self.decay, math.inf)))
         self.z = self._holding(self.z)
         cells = [problem.network.gaps[i] for i in self.fingers]
         gap = problem.network.p[np.array(cells, int)] @ self.modes.shape
         # Derivative of every gap's voltage by z; its columns for areas with a time constant are 0.
-        self.gap = np.hstack([gap, np.zeros((gap.shape[0], int(self.slow.sum())))])
+        self.gap = np.hstack([gap, np.zeros((gap.shape[0], self.rates.size - self.n))])
 
     def _guess(self) -> FloatArray:
         """The periodic state with every area held at its value at 0 V; areas with a time constant at their mean."""
@@ -242,17 +242,24 @@ class Search(Period):
                 relative[k] = float(np.mean(self.contacts[i].area(np.abs(u)))) / problem.scene.net.area0[i]
         return np.append(np.where(self.neutral[: self.n], self.kept, start), relative)
 
-    def _inverse(self, slope: FloatArray) -> FloatArray:
-        """Inverse of 1 - slope for the entries of z that decay, and zero for the neutral modes."""
-        out = np.zeros_like(slope)
-        free = np.ix_(self.free, self.free)
-        out[free] = np.linalg.inv(np.eye(int(self.free.sum())) - slope[free])
-        return out
+    def _solve_by(self, solver: FloatArray) -> None:
+        """Take an inverse of 1 - slope for the entries of z that decay, which is zero for the neutral modes."""
+        self.solver = solver
+        # Largest ratio of the periodic state's error to an error of the voltages made in every period; 1 or more.
+        grown = self.modes.shape @ solver[: self.n, : self.n] @ self.modes.inverse
+        self.memory = max(1.0, float(np.abs(grown).sum(axis=1).max(initial=0.0)))
+
+    def _measure(self) -> None:
+        """Solve by the measured slope."""
+        slope = self._slope()
+        solver, free = np.zeros_like(slope), np.ix_(self.free, self.free)
+        solver[free] = np.linalg.inv(np.eye(int(self.free.sum())) - slope[free])
+        self._solve_by(solver)
 
     def _largest(self, z: FloatArray) -> float:
         """Largest voltage in a change of z, V; the relative change of an area counts as that share of the scale."""
-        x = float(np.abs(self.modes.shape @ z[~self.slow]).max(initial=0.0))
-        return max(x, self.scale * float(np.abs(z[self.slow]).max(initial=0.0)))
+        x, areas = np.abs(self.modes.shape @ z[: self.n]).max(initial=0.0), z[self.n :]
+        return float(max(x, self.scale * np.abs(areas).max()) if areas.size else x)
 
     def passed(self, z: FloatArray, tol: float) -> _Pass:
         """One pass over the period from z, with an error of `tol` times the voltage scale in every step."""
@@ -318,7 +325,7 @@ class Search(Period):
                 break
         # Its records are views of its arrays, which a copy of what is found would separate.
         self.one, start = None, np.append(self.voltages(self.z), self.z[self.n :])
-        return Found(start, self.parts * defect, self._map_slope, self._memory(), errors, self.passes / self.parts)
+        return Found(start, self.parts * defect, self._map_slope, self.memory, errors, self.passes / self.parts)
 
     def _map_slope(self) -> FloatArray:
         slope = self._slope()
@@ -331,28 +338,27 @@ class Search(Period):
         here, smallest, since = _FIRST, math.inf, 0
         for count in range(1, _MOST + 1):
             # The solver enlarges the error of a pass by up to `memory`, so the pass needs a tolerance smaller by that.
-            memory = self._memory()
-            here = max(tol, min(here, _CRUDE * moved / self.scale / memory, _FIRST / memory))
+            here = max(tol, min(here, _CRUDE * moved / self.scale / self.memory, _FIRST / self.memory))
             last = self.passed(self.z, here)
             change = last.end - self.z
+            wanted = np.where(self.free, change, 0.0)
             if change_before is not None:
-                fell = change_before - np.where(self.free, change, 0.0)
+                fell = change_before - wanted
                 # Skip Broyden's update of the solver if the change is within the errors of the two passes.
                 if self._largest(fell) > before * self.scale:
                     answered = self.solver @ fell
                     along = float(step @ answered)
                     # A tiny denominator means that round-off dominates the step: it would spoil the solver.
                     if abs(along) > 1e-3 * float(step @ step) > 0.0:
-                        self.solver = self.solver + np.outer((step - answered) / along, step @ self.solver)
+                        self._solve_by(self.solver + np.outer((step - answered) / along, step @ self.solver))
             if count % _PATIENCE == 0:
-                self.solver = self._inverse(self._slope())
-            change_before, before = np.where(self.free, change, 0.0), here
-            step = self.solver @ change_before
+                self._measure()
+            change_before, before, step = wanted, here, self.solver @ wanted
             if count == 1 and self._largest(step) > _LONG * self.scale:
                 # For a mode that hardly decays in a period, the effect of the areas' ripple may exceed the decay, and
                 # the derivative of the linear circuit is wrong: measure it.
-                self.solver = self._inverse(self._slope())
-                step = self.solver @ change_before
+                self._measure()
+                step = self.solver @ wanted
             self.z = self._holding(self.z + step)
             moved, defect = self._largest(step), self._largest(change)
             if not moved < _ASTRAY * self.scale:
@@ -360,18 +366,12 @@ class Search(Period):
             # Round-off may prevent smaller steps; the size of the last step is then part of the stated error.
             smallest, since = (moved, 0) if moved < 0.5 * smallest or here > tol else (smallest, since + 1)
             held_up = since >= _HELD_UP and moved <= _NOISE * self.scale
-            closed = moved <= tol * self.scale or self._largest(change_before) <= 1e-15 * self.scale
+            closed = moved <= tol * self.scale or self._largest(wanted) <= 1e-15 * self.scale
             if here == tol and (closed or held_up):
                 self._mind_wandering(last, change, tol)
                 return last, step, defect
         cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
         raise no_period(self.problem, Status.NOT_PERIODIC, cause=cause)
-
-    def _memory(self) -> float:
-        """Largest ratio of the periodic state's error to an error of the voltages made in every period; 1 or more."""
-        n, modes = self.n, self.modes
-        grown = modes.shape @ self.solver[:n, :n] @ modes.inverse
-        return max(1.0, float(np.abs(grown).sum(axis=1).max(initial=0.0)))
 
     def _mind_wandering(self, last: _Pass, change: FloatArray, tol: float) -> None:
         """Refuse a state whose conserved charges change over the period: an area's ripple would pump them for ever.
@@ -408,7 +408,7 @@ class Search(Period):
         forgets = min(1.0, float(decaying.min(initial=math.inf)) * self.span)
         tol = max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL)
         base = self.passed(self.z, tol).end
-        slope = np.diag(self.turned * np.exp(-self.rates * self.span))
+        slope = np.diag(self.decay)
         for k in np.flatnonzero(self.rates * self.span < _FORGOTTEN):
             if not self.free[k]:
                 continue
