@@ -247,11 +247,9 @@ class Task(Problem):
         """A batch of all measurements, with every row of `values` (n_row, n_parameter) one after the other."""
         table = {path: np.tile(x, len(values)) for path, x in self.data.conditions.items()}
         table |= {path: values[:, at].ravel() for path, at in self.places.items()}
-        law, circuit = self.charge_law, self.circuit
-        return batch(
-            circuit if law is None else replace(circuit, charge_law=law), table, outputs=(self.data.name,),
-            rtol=rtol, periodic=self.average == "periodic", skin=self.skin, gradients=gradients,
-        )  # fmt: skip
+        circuit = self.circuit if self.charge_law is None else replace(self.circuit, charge_law=self.charge_law)
+        outputs, periodic = (self.data.name,), self.average == "periodic"
+        return batch(circuit, table, outputs=outputs, rtol=rtol, periodic=periodic, skin=self.skin, gradients=gradients)
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -419,11 +417,11 @@ def fit(
             bar.show(note=f"evaluation {number}")
 
     task = Task(circuit, names, paths, measured.scale, measured, places, average, skin, rtol, charge_law, watch)
-    task, wanted = task.begun({own_path(circuit, path): box for path, box in (bounds or {}).items()}, profiles)
+    task = task.begun({own_path(circuit, path): box for path, box in (bounds or {}).items()}, profiles)
     for text in filter(None, (*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin))):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     try:
-        return _fitted(task, starts, wanted)
+        return _fitted(task, starts)
     finally:
         bar.stop()
 
@@ -466,8 +464,7 @@ def _request(
     return data, tuple(names), tuple(paths), places
 
 
-def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
-    """The fit, with the profiles wanted."""
+def _fitted(task: Task, starts: int) -> Fit:
     from scipy.stats import norm, t
 
     data, n = task.data, task.data.values.size
@@ -499,7 +496,7 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
     means = {path: best.values[np.unique(at)] for path, at in task.places.items()}
     (of,) = data.groups.values() or ((),)
     return Fit._reported(
-        task, best, variance, reach, best.beyond_sigma(..., freedom) if data.sigma is not None else [], profiles,
+        task, best, variance, reach, best.beyond_sigma(..., freedom) if data.sigma is not None else [],
         data=data,
         predicted=data.values + (best.residual * task.scale)[:n],
         sigma=data.sigma if data.sigma is not None else math.sqrt(variance) * task.scale[:n],

@@ -300,7 +300,7 @@ def fit_contact(
     begin |= {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default or 0.0 for name in names if own[name] == 0.0}
     scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
     paths = tuple(map(named, names))
-    task, wanted = Task(circuit.varied(begin), paths, paths, scale, gap, relations).begun(
+    task = Task(circuit.varied(begin), paths, paths, scale, gap, relations).begun(
         {named(path): pair for path, pair in (bounds or {}).items()},
         profiles if isinstance(profiles, bool) else [named(path) for path in profiles],
     )
@@ -317,7 +317,7 @@ def fit_contact(
     predicted = task.predict(best.values)
     sized = zip(relations, predicted, task.split(task.scale), strict=True)
     found = ContactFit._reported(
-        task, best, variance, reach, notes, wanted,
+        task, best, variance, reach, notes,
         circuit=fitted,
         gap=gap,
         relations=relations,
@@ -412,7 +412,6 @@ def _errors(task: Task, best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray
             notes += best.beyond_sigma(at, at.size, f" of the {name}")
     if f"{task.gap}.c2" in task.names and f"{task.gap}.mu" not in task.names:
         mu = task.circuit[task.gap].values["mu"]
-        notes.append(
-            f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
-        )
+        told = f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2."
+        notes.append(f"{told} Measure the friction force.")
     return np.where(known, 1.0, math.inf), np.where(known, reach, math.inf), notes
