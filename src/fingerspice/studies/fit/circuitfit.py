@@ -453,8 +453,7 @@ def _request(
         value = circuit.parameters[path].value
         require(fitted.count(path) == 1, path, "named twice", "once")
         require(path not in data.conditions, path, "to be fitted, and is a condition of the data", "one of both")
-        logarithm = f"{value:g}, and is fitted in its logarithm"
-        require(0.0 < value < math.inf, path, logarithm, "finite and more than 0")
+        require(0.0 < value < math.inf, path, f"{value:g}, and is fitted in its logarithm", "finite and more than 0")
         places[path], labels = np.full(data.values.size, len(names)), [path]
         if path.lower() in map(str.lower, separate):
             places[path] += [every.index(label) for label in of]
@@ -497,11 +496,9 @@ def _fitted(task: Task, starts: int) -> Fit:
     (of,) = data.groups.values() or ((),)
     return Fit._reported(
         task, best, variance, reach, best.beyond_sigma(..., freedom) if data.sigma is not None else [],
-        data=data,
-        predicted=data.values + (best.residual * task.scale)[:n],
+        data=data, freedom=freedom, predicted=data.values + (best.residual * task.scale)[:n],
         sigma=data.sigma if data.sigma is not None else math.sqrt(variance) * task.scale[:n],
         objectives=tuple(end.objective for end in ends),
-        freedom=freedom,
         circuit=task.circuit.varied({path: float(np.prod(x ** (1.0 / x.size))) for path, x in means.items()}),
         circuits={label: task.scene(best.values, of.index(label), {}) for label in dict.fromkeys(of)},
     )  # fmt: skip

@@ -300,10 +300,9 @@ def fit_contact(
     begin |= {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default or 0.0 for name in names if own[name] == 0.0}
     scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
     paths = tuple(map(named, names))
-    task = Task(circuit.varied(begin), paths, paths, scale, gap, relations).begun(
-        {named(path): pair for path, pair in (bounds or {}).items()},
-        profiles if isinstance(profiles, bool) else [named(path) for path in profiles],
-    )
+    limits = {named(path): pair for path, pair in (bounds or {}).items()}
+    asked = profiles if isinstance(profiles, bool) else [named(path) for path in profiles]
+    task = Task(circuit.varied(begin), paths, paths, scale, gap, relations).begun(limits, asked)
     task, best, pools = _solved(task)
     if best.objective >= NOT_FOUND:
         said = f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data"
@@ -317,14 +316,9 @@ def fit_contact(
     predicted = task.predict(best.values)
     sized = zip(relations, predicted, task.split(task.scale), strict=True)
     found = ContactFit._reported(
-        task, best, variance, reach, notes,
-        circuit=fitted,
-        gap=gap,
-        relations=relations,
-        predicted=tuple(predicted),
+        task, best, variance, reach, notes, circuit=fitted, gap=gap, relations=relations, predicted=tuple(predicted),
         sigma=tuple(one.sigma if one.sigma is not None else share * values for one, values, share in sized),
-        freedom=scale.size - len(paths),
-        reach=dict(zip(paths, reach.tolist(), strict=True)),
+        freedom=scale.size - len(paths), reach=dict(zip(paths, reach.tolist(), strict=True)),
     )  # fmt: skip
     for relation, misfit in zip(relations, found.misfits, strict=True):
         if misfit > _TOO_MUCH:

@@ -324,11 +324,10 @@ class FitResult(Shown):
                 said = f"{a} and {b} are not told apart (correlation {both:+.4f}): they change these data in almost"
                 notes.append(f"{said} the same way, and only a combination of both is known. {task.remedy((a, b))}")
         named = " ".join(notes)
-        notes += [
-            f"Of {name} these data tell next to nothing: its error is larger than itself. {task.remedy((name,))}"
-            for name, off in zip(task.names, error, strict=True)
-            if not off < _UNKNOWN and name not in named
-        ]
+        for name, off in zip(task.names, error, strict=True):
+            if not off < _UNKNOWN and name not in named:
+                said = f"Of {name} these data tell next to nothing: its error is larger than itself."
+                notes.append(f"{said} {task.remedy((name,))}")
         return cls(
             estimates=estimates, correlation=correlation, objective=best.objective, count=best.residual.size,
             evaluations=best.evaluations, closed=best.closed, notes=(*notes, *more),
