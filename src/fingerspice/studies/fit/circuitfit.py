@@ -27,8 +27,7 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import REFUSED, batch, own_path
-from fingerspice.studies.fit import fitting
-from fingerspice.studies.fit.fitting import SIGMA, FitResult, Given, Problem, followed
+from fingerspice.studies.fit.fitting import FARTHEST, NOT_FOUND, SIGMA, FitResult, Given, Problem, followed, measured_of
 from fingerspice.studies.steady import phasor
 from fingerspice.waveforms.waveform import Sine, refuse, require
 
@@ -108,7 +107,7 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
         return key, key, _UNITS[key] if key in _UNITS else circuit.parameters[_path(circuit, name)].unit
 
     try:
-        columns, place, groups = fitting.measured_of(given, meaning, "Vdrive.amplitude (V), f_el_mean (N)", by)
+        columns, place, groups = measured_of(given, meaning, "Vdrive.amplitude (V), f_el_mean (N)", by)
     except InputError as refused:
         if by is not None or "no rows of numbers" not in refused.message:
             raise
@@ -178,7 +177,7 @@ class Task(Problem):
     @property
     def box(self) -> FloatArray:
         """Bounds also where none are given, far from the start: there are no likely values, and slow runs."""
-        (low, high), near, far = self.bounds.T, self.initial / fitting.FARTHEST, self.initial * fitting.FARTHEST
+        (low, high), near, far = self.bounds.T, self.initial / FARTHEST, self.initial * FARTHEST
         return np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
 
     def remedy(self, names: tuple[str, ...]) -> str:
@@ -469,7 +468,7 @@ def _fitted(task: Task, starts: int) -> Fit:
     data, n = task.data, task.data.values.size
     ends = [followed(task.residuals, task.box, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
-    if best.objective >= fitting.NOT_FOUND:
+    if best.objective >= NOT_FOUND:
         said = "none of the starts can be run: there is no contact, no solution, or a value out of range"
         raise InputError(f"{said}; allowed: a circuit that runs under the conditions of the data")
     freedom = best.residual.size - len(task.names)
