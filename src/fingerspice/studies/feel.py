@@ -19,7 +19,6 @@ from fingerspice.plots import drawing
 from fingerspice.plots.traces import stems
 from fingerspice.results.record import Sealed
 from fingerspice.results.solution import Solution
-from fingerspice.results.spectrum import Spectrum
 from fingerspice.waveforms.waveform import refuse, require
 
 #: Standard gravity, m/s^2.
@@ -344,11 +343,7 @@ class Feel(Sealed, Shown):
 
 
 def feel(
-    solution: Solution,
-    signal: str = "f_t",
-    *,
-    mechanics: SkinMechanics = FINGERPAD,
-    threshold: Threshold | None = None,
+    solution: Solution, signal: str = "f_t", *, mechanics: SkinMechanics = FINGERPAD, threshold: Threshold | None = None
 ) -> Feel:
     """Estimate what a hand may feel of a run, from the skin's motion under the friction and a threshold.
 
@@ -383,8 +378,18 @@ def feel(
         spectrum = solution.spectrum(signal, method="welch")
     elif end < FASTEST_FELT:
         spectrum = solution.spectrum(signal, highest=FASTEST_FELT)
-    kind = "bands" if spectrum.amplitude is None else "lines"
-    f, force, slower = _bands(spectrum) if spectrum.amplitude is None else (spectrum.frequency, spectrum.amplitude, 0.0)
+    kind, f, slower = "lines", spectrum.frequency, 0.0
+    if (force := spectrum.amplitude) is None:
+        assert spectrum.density is not None
+        kind, width = "bands", spectrum.resolution
+        # A bin belongs to the band that contains its middle; the lowest band is at least _FEWEST bins wide.
+        lowest = math.ceil(3.0 * math.log2(_FEWEST * width / (_EDGE - 1.0 / _EDGE) / 1e3))
+        highest = math.floor(3.0 * math.log2(float(f[-1]) / _EDGE / 1e3))
+        middle = 1e3 * 2.0 ** (np.arange(lowest, max(highest, lowest) + 1) / 3.0)
+        edges = np.append(middle / _EDGE, middle[-1] * _EDGE)
+        sums = np.append(0.0, np.cumsum(spectrum.density * width))[np.searchsorted(f, edges)]
+        # Amplitudes of sines of the rms of every band, and of all below them.
+        f, force, slower = middle, np.sqrt(2.0 * np.diff(sums)), math.sqrt(2.0 * sums[0])
     edge = float(f[0]) / _EDGE
     size = np.abs(mechanics.acceleration(f)) * force
     kept = size > _NOTHING * size.max(initial=0.0)
@@ -406,16 +411,3 @@ def feel(
         spectrum.signal, kind, f, force, np.abs(mechanics.displacement(f)) * force, size, level, change,
         max(unjudged, default=None), mechanics, table,
     )  # fmt: skip
-
-
-def _bands(spectrum: Spectrum) -> tuple[FloatArray, FloatArray, float]:
-    """Middles (Hz) of the bands that the density resolves; amplitudes of sines of their rms, and of all below them."""
-    assert spectrum.density is not None
-    width = spectrum.resolution
-    # A bin belongs to the band that contains its middle; the lowest band is at least _FEWEST bins wide.
-    lowest = math.ceil(3.0 * math.log2(_FEWEST * width / (_EDGE - 1.0 / _EDGE) / 1e3))
-    highest = math.floor(3.0 * math.log2(float(spectrum.frequency[-1]) / _EDGE / 1e3))
-    middle = 1e3 * 2.0 ** (np.arange(lowest, max(highest, lowest) + 1) / 3.0)
-    edges = np.append(middle / _EDGE, middle[-1] * _EDGE)
-    sums = np.append(0.0, np.cumsum(spectrum.density * width))[np.searchsorted(spectrum.frequency, edges)]
-    return middle, np.sqrt(2.0 * np.diff(sums)), math.sqrt(2.0 * sums[0])

@@ -166,20 +166,19 @@ def capability(
     require_circuit(circuit)
     limit, means = positive_number("limit", limit, "V"), whole_number("means", means, 3, 1000)
     carrier = None if carrier is None else positive_number("carrier", carrier, "Hz")
-    top = 1000.0 if carrier is None else min(1000.0, carrier / 8.0)
+    highest = math.inf if carrier is None else carrier / 4.0
+    top = min(1000.0, 0.5 * highest)
     own = np.geomspace(min(5.0, 0.1 * top), top, 13)
     f = positive_row("frequency", own if frequency is None else frequency, "Hz")
-    if carrier is not None and f.max() > carrier / 4.0:
-        allowed = f"at most a quarter of the carrier's {carrier:g} Hz"
-        raise InputError(f"frequency reaches {f.max():g} Hz; allowed: {allowed}")
+    allowed = f"at most a quarter of the carrier's {4.0 * highest:g} Hz"
+    refuse(f.max() > highest, f"frequency reaches {f.max():g} Hz; allowed: {allowed}")
     finger = Finger(circuit, charge_law)
     mu = finger.contact.mu
     refuse(mu == 0.0, f"{finger.gap.name} has mu=0 and no friction; allowed: mu > 0")
     # The charges in the layers can raise the gap voltage above the source voltage, but not to ten times the limit.
     most = 0.4 * float(finger.force(10.0 * limit))
     search = _Search(finger, limit, carrier, most)
-    largest = search.largest(lambda x: search.wanted(x, 1.0 / _LASTS, 0.0), most)
-    force = np.linspace(0.0, largest, means)
+    force = np.linspace(0.0, search.largest(lambda x: search.wanted(x, 1.0 / _LASTS, 0.0), most), means)
     amplitude = np.zeros((means, f.size))
     for i, mean in enumerate(force[1:-1].tolist(), 1):
         amplitude[i] = [search.largest(partial(search.wanted, mean, x), mean) for x in f.tolist()]
@@ -218,8 +217,7 @@ class _Search:
                 break
             force = wanted(found)
             end = (force.values.size - 1) / force.rate
-            task = Task(self.finger, "force", force, end, force.rate, self.carrier)
-            peak = task.solve(close=0.3 * EXACT).peak
+            peak = Task(self.finger, "force", force, end, force.rate, self.carrier).solve(close=0.3 * EXACT).peak
             before, self.ratio = self.ratio, peak / self._peak(force)
             if abs(self.ratio / before - 1.0) < 0.5 * EXACT or (found == most and peak <= self.limit):
                 break
@@ -379,8 +377,7 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
     waves = {e.name: e.waveform for e in circuit.by_device("V") if e.waveform is not None}
 
     def folds(voltage: float) -> bool:
-        by = as_waveform(voltage / peak)
-        raised = circuit.varied({name: Product((by, wave)) for name, wave in waves.items()})
+        raised = circuit.varied({name: Product((as_waveform(voltage / peak), wave)) for name, wave in waves.items()})
         try:
             problem = prepare(raised, t_stop=t_stop, charge_law="mobile", charge=False, rtol=RTOL)
             if problem.network.stack is not None and (met := meets_fold(problem, RTOL)) is not None:

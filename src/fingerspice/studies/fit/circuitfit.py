@@ -27,8 +27,7 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import REFUSED, batch, own_path
-from fingerspice.studies.fit import fitting
-from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Problem, followed
+from fingerspice.studies.fit.fitting import FARTHEST, NOT_FOUND, SIGMA, FitResult, Given, Problem, followed, measured_of
 from fingerspice.studies.steady import phasor
 from fingerspice.waveforms.waveform import Sine, refuse, require
 
@@ -108,7 +107,7 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
         return key, key, _UNITS[key] if key in _UNITS else circuit.parameters[_path(circuit, name)].unit
 
     try:
-        columns, place, groups = fitting.measured_of(given, meaning, "Vdrive.amplitude (V), f_el_mean (N)", by)
+        columns, place, groups = measured_of(given, meaning, "Vdrive.amplitude (V), f_el_mean (N)", by)
     except InputError as refused:
         if by is not None or "no rows of numbers" not in refused.message:
             raise
@@ -178,7 +177,7 @@ class Task(Problem):
     @property
     def box(self) -> FloatArray:
         """Bounds also where none are given, far from the start: there are no likely values, and slow runs."""
-        (low, high), near, far = self.bounds.T, self.initial / fitting.FARTHEST, self.initial * fitting.FARTHEST
+        (low, high), near, far = self.bounds.T, self.initial / FARTHEST, self.initial * FARTHEST
         return np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
 
     def remedy(self, names: tuple[str, ...]) -> str:
@@ -193,11 +192,31 @@ class Task(Problem):
         return "Fix one of them to a value known from elsewhere."
 
     def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of a signal by one run, of means by batches; their derivatives with an error that suits least squares."""
         self.watch()
-        if self.data.signal == IMPEDANCE:
+        data, paths = self.data, self.paths
+        if data.signal == IMPEDANCE:
             return super().compared(values)
-        found, by = self._means(values) if self.data.t is None else self._signal(values)
-        return (found - self.data.values) / self.scale, by * values / self.scale[:, None]
+        if data.t is not None:
+            circuit = self.scene(values, 0, data.conditions)
+            waves = network_of(circuit).waveforms
+            if self.skin == "follow" and len(waves) == 1 and (sine := waves[0].fundamental) is not None:
+                circuit = circuit.varied({f"{e.name}.f": sine.frequency for e in circuit.by_device("SKIN")})
+            run = simulate(
+                circuit, t_eval=data.t, rtol=self.rtol, charge_law=self.charge_law, charge=False, sensitivities=paths
+            )
+            found = getattr(run, data.name)
+            by = np.array([getattr(run.sensitivities[path], data.name) for path in paths]).T
+        else:
+            slopes = self.scenes(values[None], max(self.rtol, _SLOPES), tuple(self.places))
+            means = self.scenes(values[None], self.rtol)
+            for one, status in ((slopes, "gradient_status"), (means, "status")):
+                if np.any(one[status].to_numpy() >= REFUSED):
+                    raise InputError(one.attrs["failures"][0])
+            found, by = means[data.name].to_numpy(), np.zeros((data.values.size, values.size))
+            for i, at in enumerate(self.places.values()):
+                by[np.arange(at.size), at] = slopes[f"d_{data.name}"].to_numpy()[:, i]
+        return (found - data.values) / self.scale, by * values / self.scale[:, None]
 
     def scene(self, values: FloatArray, row: int, conditions: Mapping[str, FloatArray]) -> Circuit:
         """The circuit of one measurement, under some conditions."""
@@ -223,40 +242,13 @@ class Task(Problem):
             off = np.append(off, np.remainder(np.angle(z, deg=True) - data.phase + 180.0, 360.0) - 180.0)
         return np.asarray(off / self.scale)
 
-    def _signal(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The predicted signal over time (n,), and its derivatives by the parameters (n, n_parameter)."""
-        circuit = self.scene(values, 0, self.data.conditions)
-        waves = network_of(circuit).waveforms
-        if self.skin == "follow" and len(waves) == 1 and (sine := waves[0].fundamental) is not None:
-            circuit = circuit.varied({f"{e.name}.f": sine.frequency for e in circuit.by_device("SKIN")})
-        run = simulate(
-            circuit, t_eval=self.data.t, rtol=self.rtol, charge_law=self.charge_law, charge=False,
-            sensitivities=self.paths,
-        )  # fmt: skip
-        by = [getattr(run.sensitivities[path], self.data.name) for path in self.paths]
-        return getattr(run, self.data.name), np.array(by).T
-
-    def _means(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As `_signal`, of means, from batches; the derivatives with an error that suits least squares."""
-        by = np.zeros((self.data.values.size, values.size))
-        slopes = self.scenes(values[None], max(self.rtol, _SLOPES), tuple(self.places))
-        found = self.scenes(values[None], self.rtol)
-        for one, status in ((slopes, "gradient_status"), (found, "status")):
-            if np.any(one[status].to_numpy() >= REFUSED):
-                raise InputError(one.attrs["failures"][0])
-        for i, at in enumerate(self.places.values()):
-            by[np.arange(at.size), at] = slopes[f"d_{self.data.name}"].to_numpy()[:, i]
-        return found[self.data.name].to_numpy(), by
-
     def scenes(self, values: FloatArray, rtol: float, gradients: tuple[str, ...] = ()) -> Dataset:
         """A batch of all measurements, with every row of `values` (n_row, n_parameter) one after the other."""
         table = {path: np.tile(x, len(values)) for path, x in self.data.conditions.items()}
         table |= {path: values[:, at].ravel() for path, at in self.places.items()}
-        law, circuit = self.charge_law, self.circuit
-        return batch(
-            circuit if law is None else replace(circuit, charge_law=law), table, outputs=(self.data.name,),
-            rtol=rtol, periodic=self.average == "periodic", skin=self.skin, gradients=gradients,
-        )  # fmt: skip
+        circuit = self.circuit if self.charge_law is None else replace(self.circuit, charge_law=self.charge_law)
+        outputs, periodic = (self.data.name,), self.average == "periodic"
+        return batch(circuit, table, outputs=outputs, rtol=rtol, periodic=periodic, skin=self.skin, gradients=gradients)
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -424,11 +416,11 @@ def fit(
             bar.show(note=f"evaluation {number}")
 
     task = Task(circuit, names, paths, measured.scale, measured, places, average, skin, rtol, charge_law, watch)
-    task, wanted = task.begun({own_path(circuit, path): box for path, box in (bounds or {}).items()}, profiles)
+    task = task.begun({own_path(circuit, path): box for path, box in (bounds or {}).items()}, profiles)
     for text in filter(None, (*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin))):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     try:
-        return _fitted(task, starts, wanted)
+        return _fitted(task, starts)
     finally:
         bar.stop()
 
@@ -460,8 +452,7 @@ def _request(
         value = circuit.parameters[path].value
         require(fitted.count(path) == 1, path, "named twice", "once")
         require(path not in data.conditions, path, "to be fitted, and is a condition of the data", "one of both")
-        logarithm = f"{value:g}, and is fitted in its logarithm"
-        require(0.0 < value < math.inf, path, logarithm, "finite and more than 0")
+        require(0.0 < value < math.inf, path, f"{value:g}, and is fitted in its logarithm", "finite and more than 0")
         places[path], labels = np.full(data.values.size, len(names)), [path]
         if path.lower() in map(str.lower, separate):
             places[path] += [every.index(label) for label in of]
@@ -471,21 +462,29 @@ def _request(
     return data, tuple(names), tuple(paths), places
 
 
-def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
-    """The fit, with the profiles wanted."""
+def _fitted(task: Task, starts: int) -> Fit:
     from scipy.stats import norm, t
 
     data, n = task.data, task.data.values.size
     ends = [followed(task.residuals, task.box, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
-    if best.objective >= fitting.NOT_FOUND:
+    if best.objective >= NOT_FOUND:
         said = "none of the starts can be run: there is no contact, no solution, or a value out of range"
         raise InputError(f"{said}; allowed: a circuit that runs under the conditions of the data")
     freedom = best.residual.size - len(task.names)
     if data.sigma is None and data.t is None and data.signal != IMPEDANCE and freedom >= _CHOOSING:
-        task, ends = _with_likelier_noise(task, ends, best)
-        best = min(ends, key=lambda end: end.objective)
         freedom -= 1
+        predicted = np.abs(data.values + best.residual * task.scale)
+        if np.all(predicted > 0.0) and best.objective != 0.0:
+            shares = replace(task, scale=predicted)
+            others = [followed(shares.residuals, shares.box, end.values) for end in ends]
+            other = min(others, key=lambda end: end.objective)
+            least = other.objective
+            # The largest likelihood of normal errors of unknown size is RSS^(-n/2) over the product of the scales.
+            equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
+            # Shares that fit to the last bit are the likelier ones.
+            if least == 0.0 or 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY:
+                task, ends, best = shares, others, other
     variance, reach = math.inf, math.inf
     if data.sigma is not None:
         variance, reach = 1.0, float(norm.ppf(0.975))
@@ -495,32 +494,13 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
     means = {path: best.values[np.unique(at)] for path, at in task.places.items()}
     (of,) = data.groups.values() or ((),)
     return Fit._reported(
-        task, best, variance, reach, best.beyond_sigma(..., freedom) if data.sigma is not None else [], profiles,
-        data=data,
-        predicted=data.values + (best.residual * task.scale)[:n],
+        task, best, variance, reach, best.beyond_sigma(..., freedom) if data.sigma is not None else [],
+        data=data, freedom=freedom, predicted=data.values + (best.residual * task.scale)[:n],
         sigma=data.sigma if data.sigma is not None else math.sqrt(variance) * task.scale[:n],
         objectives=tuple(end.objective for end in ends),
-        freedom=freedom,
         circuit=task.circuit.varied({path: float(np.prod(x ** (1.0 / x.size))) for path, x in means.items()}),
         circuits={label: task.scene(best.values, of.index(label), {}) for label in dict.fromkeys(of)},
     )  # fmt: skip
-
-
-def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
-    """The fits with errors that are equal shares of the data, or, where this is clearly likelier, equal for all.
-
-    The largest likelihood of normal errors of unknown size is RSS^(-n/2) over the product of the scales.
-    """
-    predicted = np.abs(task.data.values + best.residual * task.scale)
-    if not np.all(predicted > 0.0) or best.objective == 0.0:
-        return task, ends
-    shares = replace(task, scale=predicted)
-    others = [followed(shares.residuals, shares.box, end.values) for end in ends]
-    least, n = min(end.objective for end in others), predicted.size
-    equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
-    # Shares that fit to the last bit are the likelier ones.
-    likelier = least == 0.0 or 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY
-    return (shares, others) if likelier else (task, ends)
 
 
 def _starts(task: Task, count: int) -> list[FloatArray]:

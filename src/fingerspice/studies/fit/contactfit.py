@@ -300,10 +300,9 @@ def fit_contact(
     begin |= {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default or 0.0 for name in names if own[name] == 0.0}
     scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
     paths = tuple(map(named, names))
-    task, wanted = Task(circuit.varied(begin), paths, paths, scale, gap, relations).begun(
-        {named(path): pair for path, pair in (bounds or {}).items()},
-        profiles if isinstance(profiles, bool) else [named(path) for path in profiles],
-    )
+    limits = {named(path): pair for path, pair in (bounds or {}).items()}
+    asked = profiles if isinstance(profiles, bool) else [named(path) for path in profiles]
+    task = Task(circuit.varied(begin), paths, paths, scale, gap, relations).begun(limits, asked)
     task, best, pools = _solved(task)
     if best.objective >= NOT_FOUND:
         said = f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data"
@@ -313,18 +312,13 @@ def fit_contact(
         fitted = circuit.replace(dict(zip(paths, best.values.tolist(), strict=True)))
     except InputError as refused:
         raise InputError(f"the fitted values do not go with the circuit's others: {refused.message}") from None
-    variance, reach = _errors(best, pools)
+    variance, reach, notes = _errors(task, best, pools)
     predicted = task.predict(best.values)
     sized = zip(relations, predicted, task.split(task.scale), strict=True)
     found = ContactFit._reported(
-        task, best, variance, reach, _further_notes(task, best, pools), wanted,
-        circuit=fitted,
-        gap=gap,
-        relations=relations,
-        predicted=tuple(predicted),
+        task, best, variance, reach, notes, circuit=fitted, gap=gap, relations=relations, predicted=tuple(predicted),
         sigma=tuple(one.sigma if one.sigma is not None else share * values for one, values, share in sized),
-        freedom=scale.size - len(paths),
-        reach=dict(zip(paths, reach.tolist(), strict=True)),
+        freedom=scale.size - len(paths), reach=dict(zip(paths, reach.tolist(), strict=True)),
     )  # fmt: skip
     for relation, misfit in zip(relations, found.misfits, strict=True):
         if misfit > _TOO_MUCH:
@@ -388,8 +382,8 @@ def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
     return task, best, pools
 
 
-def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, FloatArray]:
-    """Variance of every parameter's residuals over their scale, and Student's t with the freedom of Satterthwaite.
+def _errors(task: Task, best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, FloatArray, list[str]]:
+    """Variance of every parameter's residuals over their scale, Student's t with the freedom of Satterthwaite, notes.
 
     (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
     residuals, and a part in the variance of a parameter; without a measure of one that has a part, nothing is known.
@@ -403,18 +397,15 @@ def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, FloatArray
         each = shares**2 / np.where(left >= _FEWEST, left, 0.0)[:, None]
         inverse = np.where(shares > _NO_PART, each, 0.0).sum(axis=0)
         reach = np.where(inverse > 0.0, t.ppf(0.975, 1.0 / inverse), norm.ppf(0.975))
-    known = np.isfinite(inverse)
-    return np.where(known, 1.0, math.inf), np.where(known, reach, math.inf)
-
-
-def _further_notes(task: Task, best: Fitted, pools: Sequence[Pool]) -> list[str]:
-    found = []
+    known, notes = np.isfinite(inverse), list[str]()
     for name, at, freedom in pools:
         if freedom < _FEWEST:
             few = f"Of the {name} there are hardly more values ({at.size}) than parameters"
-            found.append(f"{few}, which leaves no measure of their errors: measure more of them, or give sigma.")
+            notes.append(f"{few}, which leaves no measure of their errors: measure more of them, or give sigma.")
         if math.isinf(freedom):
-            found += best.beyond_sigma(at, at.size, f" of the {name}")
-    fitted, mu = {path.rpartition(".")[2] for path in task.names}, task.circuit[task.gap].values["mu"]
-    told = f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
-    return [*found, told] if "c2" in fitted and "mu" not in fitted else found
+            notes += best.beyond_sigma(at, at.size, f" of the {name}")
+    if f"{task.gap}.c2" in task.names and f"{task.gap}.mu" not in task.names:
+        mu = task.circuit[task.gap].values["mu"]
+        told = f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2."
+        notes.append(f"{told} Measure the friction force.")
+    return np.where(known, 1.0, math.inf), np.where(known, reach, math.inf), notes

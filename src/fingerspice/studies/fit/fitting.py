@@ -117,6 +117,7 @@ class Problem:
     scale: FloatArray  # (n,): By which residuals are divided
     #: (n_parameter, 2): Smallest and largest values, 0 and infinity by default; made by `begun`
     bounds: FloatArray = field(default_factory=lambda: np.empty((0, 2)), kw_only=True)
+    profiles: tuple[str, ...] = field(default=(), kw_only=True)  # Names whose profiles are wanted; made by `begun`
 
     @property
     def initial(self) -> FloatArray:
@@ -151,10 +152,8 @@ class Problem:
         except (InputError, SolveError):
             return np.full(self.scale.size, REFUSED), np.zeros((self.scale.size, values.size))
 
-    def begun(
-        self, bounds: Mapping[str, tuple[float, float]], profiles: bool | Sequence[str]
-    ) -> tuple[Self, Sequence[str]]:
-        """With bounds as given, and a start moved into them; and the names whose profiles are wanted, as they are."""
+    def begun(self, bounds: Mapping[str, tuple[float, float]], profiles: bool | Sequence[str]) -> Self:
+        """With bounds and profiles as given, and a start moved into the bounds."""
         n, count, circuit, box = self.scale.size, len(self.paths), self.circuit, []
         refuse(n < count, f"{n} data cannot tell {count} parameters; allowed: at least as many data")
         given, fitted = {path.lower(): tuple(pair) for path, pair in bounds.items()}, ", ".join(self.paths)
@@ -177,7 +176,8 @@ class Problem:
         for name in wanted:
             said = f"profiles names {name!r}, which is not fitted; allowed: True, or {', '.join(self.names)}"
             refuse(not isinstance(name, str) or name.lower() not in names, said)
-        return replace(self, circuit=circuit, bounds=np.array(box, float)), [names[name.lower()] for name in wanted]
+        asked = tuple(names[name.lower()] for name in wanted)
+        return replace(self, circuit=circuit, bounds=np.array(box, float), profiles=asked)
 
 
 class Fitted(NamedTuple):
@@ -295,10 +295,7 @@ class FitResult(Shown):
     profiles: dict[str, Profile]
 
     @classmethod
-    def _reported(
-        cls, task: Problem, best: Fitted, variance: Any, half: Any, more: Sequence[str], profiles: Sequence[str],
-        **own: Any,
-    ) -> Self:  # fmt: skip
+    def _reported(cls, task: Problem, best: Fitted, variance: Any, half: Any, more: Sequence[str], **own: Any) -> Self:
         """What the best fit tells, with further notes (`more`) and what is a kind's `own`.
 
         `variance` is that of the residuals over their scale, and `half` half an interval over a standard error of the
@@ -327,15 +324,14 @@ class FitResult(Shown):
                 said = f"{a} and {b} are not told apart (correlation {both:+.4f}): they change these data in almost"
                 notes.append(f"{said} the same way, and only a combination of both is known. {task.remedy((a, b))}")
         named = " ".join(notes)
-        notes += [
-            f"Of {name} these data tell next to nothing: its error is larger than itself. {task.remedy((name,))}"
-            for name, off in zip(task.names, error, strict=True)
-            if not off < _UNKNOWN and name not in named
-        ]
+        for name, off in zip(task.names, error, strict=True):
+            if not off < _UNKNOWN and name not in named:
+                said = f"Of {name} these data tell next to nothing: its error is larger than itself."
+                notes.append(f"{said} {task.remedy((name,))}")
         return cls(
             estimates=estimates, correlation=correlation, objective=best.objective, count=best.residual.size,
             evaluations=best.evaluations, closed=best.closed, notes=(*notes, *more),
-            profiles={name: _profile_of(task, best, estimates[name], rooms[name]) for name in profiles}, **own,
+            profiles={name: _profile_of(task, best, estimates[name], rooms[name]) for name in task.profiles}, **own,
         )  # fmt: skip
 
     def _panels(self) -> list[Any]:
