@@ -232,20 +232,18 @@ def add_command(app: typer.Typer, options: str, function: Callable[..., Callable
         if then is not None:
             then()
 
-    taken = [_declared(known[key]) for key in options.split()]
+    taken = []
+    for one in (known[key] for key in options.split()):
+        # As typer takes it: an annotation has the help, and what stands for the value there.
+        kind, said, *value = get_args(one.annotation)
+        if isinstance(said, str):
+            # With its name a switch has no second option that switches it off.
+            said = Option(f"--{one.name.replace('_', '-')}", help=said, metavar=value[0] if value else None)
+        taken.append(one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, said]))
     # In the help an empty line keeps two lines apart.
     call.__doc__ = (inspect.getdoc(function) or "").replace("\n  fingerspice", "\n\n  fingerspice")
     call.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]
     app.command(name)(call)
-
-
-def _declared(one: inspect.Parameter) -> inspect.Parameter:
-    """A parameter as typer takes it: its annotation has its help, and what stands for its value there."""
-    kind, said, *value = get_args(one.annotation)
-    if isinstance(said, str):
-        # With its name a switch has no second option that switches it off.
-        said = Option(f"--{one.name.replace('_', '-')}", help=said, metavar=value[0] if value else None)
-    return one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, said])
 
 
 def _with_set(circuit: fs.Circuit, option: str, text: str) -> fs.Circuit:

@@ -26,10 +26,8 @@ from fingerspice.plots.drawing import save
 from fingerspice.results.record import SIGNALS
 from fingerspice.waveforms.waveform import refuse
 
-#: Traces of each kind, and harmonics.
-MOST_TRACES, HARMONICS = 8, 20
-#: Longest time of a run after its compilation, s.
-LONGEST_RUN = 10.0
+MOST_TRACES, HARMONICS = 8, 20  # Traces of each kind, and harmonics
+LONGEST_RUN = 10.0  # Longest time of a run after its compilation, s
 _SHOWN = ("u_source", "u_gap", "f_el", "area", "friction")
 _WITHOUT_GAP = ("u_source", "u_layer", "v", "area")
 _FIGURES = ("mean", "max", "min", "mean_periodic")
@@ -275,10 +273,8 @@ def _changes(circuit: fs.Circuit, entry: str) -> tuple[str, str | None, dict[str
     return one.name, to or None, dict(one.apply(circuit, to or None).sets[one.name])
 
 
-#: Characters of an exported deck beyond which the page does not take it.
-_LONGEST_EXPORT = 20_000_000
-#: Largest error of the means against frequency: a picture shows no more.
-_RTOL = 1e-5
+_LONGEST_EXPORT = 20_000_000  # Characters of an exported deck beyond which the page does not take it
+_RTOL = 1e-5  # Largest error of the means against frequency: a picture shows no more
 _AS_CODE = re.compile(r"\b([A-Z][A-Za-z]*)\(")
 _DISPERSIVE = """\
 def dispersive(e):

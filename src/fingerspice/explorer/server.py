@@ -155,6 +155,9 @@ class Explorer:
 def explore(shown: fs.Circuit | fs.Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
     """Show a circuit, or a run's circuit, on a local page on which its values can be changed (docs/explore.md).
 
+    The `Explorer` runs until its `stop` is called, or the program ends; `wait` lets a script wait for Ctrl-C. A
+    notebook keeps the latest eight that it shows.
+
     Parameters
     ----------
     shown : Circuit or Solution, optional
@@ -165,19 +168,12 @@ def explore(shown: fs.Circuit | fs.Solution | None = None, *, port: int = 0, bro
     browser : bool
         Whether the page is shown: in a notebook below the cell whose last line this is, and otherwise in the browser.
 
-    Returns
-    -------
-    Explorer
-        It runs until its `stop` is called, or the program ends; `wait` lets a script wait for Ctrl-C. A notebook keeps
-        the latest eight that it shows.
-
     Raises
     ------
     InputError
         If the port is taken, or no port number.
     """
-    asked = asked_by(shown) if isinstance(shown, fs.Solution) else {}
-    circuit = shown.circuit if isinstance(shown, fs.Solution) else shown
+    circuit, asked = (shown.circuit, asked_by(shown)) if isinstance(shown, fs.Solution) else (shown, {})
     framed = browser and in_notebook()
     explorer = Explorer(circuit, port, asked=asked, framed=framed)
     if framed:

@@ -77,8 +77,12 @@ def plot_solution(solution: Solution, signals: Any = None, window: Any = None, o
         for trace in traces if zoomed is not None else ():
             _draw_line(last, trace._replace(label="_"), factor, *spans[-1], time_unit(runs)[0])
         if keys == ["f_el"] and len(traces) == 1:
-            for ax in (first, *enlarged):
-                _draw_mean(ax, traces[0], factor, unit, told=ax is last)
+            mean, of = traces[0].solution.f_el_mean_periodic, "the last period"
+            if mean is None:
+                mean, of = traces[0].solution.f_el_mean, "the run"
+            for ax in (first, *enlarged) if mean is not None else ():
+                label = f"mean of {of}, {factor * mean:.4g} {unit}" if ax is last else "_"
+                ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
             if enlarged:
                 drawing.legend_above(last, 1)
         finish_panel(first, keys, traces, factor, unit, _HALF if enlarged else _PAGE)
@@ -274,15 +278,6 @@ def _draw_line(
     edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
     ax.plot(t, low, **edge)
     ax.plot(t, high, **edge, label=trace.label)
-
-
-def _draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
-    """Draw the mean force as a horizontal line; with `told` the legend names it."""
-    for kind, of in (("f_el_mean_periodic", "of the last period"), ("f_el_mean", "of the run")):
-        if (mean := trace.solution.summary().get(kind)) is not None:
-            label = f"mean {of}, {factor * mean:.4g} {unit}" if told else "_"
-            ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
-            break
 
 
 def finish_panel(

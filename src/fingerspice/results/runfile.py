@@ -291,10 +291,6 @@ def load(path: str | Path) -> Solution:
     ----------
     path : str or Path
 
-    Returns
-    -------
-    Solution
-
     Raises
     ------
     InputError

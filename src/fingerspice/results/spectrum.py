@@ -98,13 +98,7 @@ class Spectrum(Sealed, Shown):
         return Page([head, f"{lines}, {self.resolution:.4g} Hz apart, as of {self.segments:.3g} independent segments"])
 
     def plot(self) -> Figure:
-        """Draw the lines, or the density with its interval, against frequency.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
-        """
+        """Draw the lines, or the density with its interval, against frequency, as a figure like `Solution.plot`'s."""
         from fingerspice.plots.traces import plot_spectrum
 
         return plot_spectrum(self)
@@ -287,8 +281,8 @@ class PhasorSolution(Shown):
         Remarks on how the sweep was made.
     warnings : tuple of str
         Warnings of extrapolation and of implausible results.
-    circuit : Circuit or None
-        The circuit of the sweep.
+    circuit : Circuit
+        Of the sweep.
     impedance : ndarray of complex or None
         Voltage of the source over its current, ohm; None for a large-signal sweep or several sources.
     nodes : tuple of str
@@ -305,11 +299,11 @@ class PhasorSolution(Shown):
     f_el_mean: FloatArray
     amplitude: float
     layers: tuple[str, ...]
-    phase: float = 0.0
-    drive: str = ""
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    circuit: Circuit | None = None
+    phase: float
+    drive: str
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+    circuit: Circuit
     impedance: ComplexArray | None = None
     nodes: tuple[str, ...] = ()
     v_nodes: ComplexArray | None = None
@@ -361,8 +355,6 @@ class PhasorSolution(Shown):
         """Gain, phase, mean force and area, or without GAP the node voltages, against frequency."""
         from fingerspice.plots.traces import plot_phasor
 
-        require(self.circuit is not None, "circuit", self.circuit, "a sweep that phasor or large_signal made")
-        assert self.circuit is not None
         return plot_phasor((self,), self.circuit)
 
 
