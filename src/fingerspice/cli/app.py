@@ -311,21 +311,21 @@ def figures(
       fingerspice figures --out out --only 4 --only 5
       fingerspice figures --gallery
     """
-    from fingerspice.explorer.scene import decks, draw, scenes
+    from fingerspice.explorer.scene import draw, shown_runs
     from fingerspice.studies.figures import FIGURES, make_figures
 
     if gallery and only:
         raise InputError("--only and --gallery are both given; allowed: one of them")
     folder = (job.out or FOLDER) / ("gallery" if gallery else "")
     # The decks are those of `circuits` below the current folder.
-    entries = [*decks(Path("circuits")), *scenes()] if gallery else []
-    drawn = {folder / f"{one.name}.png": one for one in entries}
+    runs = shown_runs(Path("circuits")) if gallery else {}
+    drawn = {folder / f"{name}.png": run for name, run in runs.items()}
     for file in drawn or [folder / f"fig{one}.{kind}" for one in only or FIGURES for kind in ("png", "csv")]:
         check_output(file)
     with paced("drawing") as update:
         files = [*drawn] or make_figures(folder, only=only, progress=update)
-        for i, (file, one) in enumerate(drawn.items(), 1):
-            draw(one, file)
+        for i, (file, run) in enumerate(drawn.items(), 1):
+            draw(run, file)
             update(i / len(drawn))
     job.answer.update(files=[*map(str, files)])
     job.give(str)

@@ -297,20 +297,15 @@ class Asked:
 
     deck: str  # Text of the netlist
     overrides: Mapping[str, float] = MappingProxyType({})  # Path to value, in the netlist's unit
-    # Text of another source, ``SQUARE(200 100)`` or ``NAME=SQUARE(200 100)``; empty for the deck's own
-    source: str = ""
+    source: str = ""  # Another source, ``SQUARE(200 100)`` or ``NAME=SQUARE(200 100)``; empty for the deck's own
     charge_law: str | None = None  # None for the deck's own
     area: str | float = "coupled"  # As in `simulate`
-    # ``own``: the data of SKIN are taken at its f; ``follow``: at the source's fundamental; ``dispersive``: at all
-    # frequencies
-    skin: str = "own"
+    skin: str = "own"  # Data of SKIN: own, at its f; follow, at the fundamental; dispersive, at all frequencies
     rtol: float = 1e-6  # Largest error of gap voltage and force, relative to their peaks
-    # Length of the run in periods of the source; a source without a period runs to the deck's TSTOP
-    periods: float = 5.0
+    periods: float = 5.0  # Length of the run in periods of the source; without a period it runs to the deck's TSTOP
     last: float | None = None  # How many of the last periods are shown; None for all of the run
     recording: Recording | None = None  # The file dropped on the page, for the source ``RECORDING(gain)``
-    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they change
-    # nothing, and the page shows their caveats
+    # Named sets with commas, ``NAME`` or ``ELEMENT=NAME``, whose caveats the page shows; their values are given already
     sets: str = ""
 
     base: fs.Circuit  # The deck's

@@ -80,9 +80,10 @@ def plot_solution(solution: Solution, signals: Any = None, window: Any = None, o
             mean, of = traces[0].solution.f_el_mean_periodic, "the last period"
             if mean is None:
                 mean, of = traces[0].solution.f_el_mean, "the run"
-            for ax in (first, *enlarged) if mean is not None else ():
-                label = f"mean of {of}, {factor * mean:.4g} {unit}" if ax is last else "_"
-                ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
+            for ax in (first, *enlarged):
+                if mean is not None:
+                    label = f"mean of {of}, {factor * mean:.4g} {unit}" if ax is last else "_"
+                    ax.axhline(factor * mean, c=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
             if enlarged:
                 drawing.legend_above(last, 1)
         finish_panel(first, keys, traces, factor, unit, _HALF if enlarged else _PAGE)

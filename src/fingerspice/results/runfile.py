@@ -270,8 +270,8 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
                 rows = [np.flatnonzero(~keep), *(x[~keep] for x, _, _ in solution.signals.values())]
                 tables["before"] = np.column_stack(rows)
             for name, table in tables.items():
-                own = ("jump", "signal") if name == "before" else (f"{name}_{axis}" for axis in range(table.ndim))
-                dimensions = tuple(own)
+                axes = tuple(f"{name}_{axis}" for axis in range(table.ndim))
+                dimensions = ("jump", "signal") if name == "before" else axes
                 group.dimensions.update(zip(dimensions, table.shape, strict=True))
                 group.create_variable(name, dimensions, dtype=float, data=table)
         write_pieces(target, content.getbuffer())
@@ -357,9 +357,8 @@ def _circuit(file: Any, run: dict[str, Any]) -> Circuit:
     try:
         if isinstance(kept, str):
             raise ValueError(kept)
-        names = [f"circuit{k}" for k in range(int(run["arrays"]))]
-        made = made_again(kept, [np.asarray(group.variables[name][...], float) for name in names])
-        return made._with(text=_text(file.attrs["deck"]))
+        arrays = [np.asarray(group.variables[f"circuit{k}"][...], float) for k in range(int(run["arrays"]))]
+        return made_again(kept, arrays)._with(text=_text(file.attrs["deck"]))
     except (InputError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError) as error:
         told = f"the circuit of this run cannot be made again from its file ({error}); its elements are left out"
         warnings.warn(told, FingerspiceWarning, stacklevel=4)
@@ -381,7 +380,15 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
             if kind in _WAVEFORMS.values():
                 own = {"kind": kind.__name__} | {f.name: getattr(value, f.name) for f in fields(kind)}
             else:
-                own = _tabulated(value, stop, rtol, circuit.tran.step if circuit.tran else 1e-3 * stop)
+                end = stop if value.period is None else value.settled + value.period
+                step = circuit.tran.step if circuit.tran else 1e-3 * stop
+                # The run has warned of edges.
+                with warnings.catch_warnings(action="ignore"):
+                    table = source_table(value, 0.0, end, min(1e-3, max(0.05 * rtol, 1e-14)), step)
+                breaks = value.breakpoints(0.0, end)
+                name = getattr(getattr(value, "function", None), "__name__", "")
+                own = {"kind": "Function", "name": name, "repeat": value.period}
+                own |= {"breaks": breaks[breaks < end].tolist(), "edges": table.edges, "series": table.series}
             return {name: plain(x) for name, x in own.items()}
         if isinstance(value, tuple) and any(isinstance(x, Waveform) for x in value):
             return [plain(part) for part in value]
@@ -402,19 +409,6 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
     if count > MOST_NUMBERS:
         return f"its sources have {count:,} numbers, and a file keeps at most {MOST_NUMBERS:,}", []
     return kept, arrays
-
-
-def _tabulated(wave: Waveform, stop: float, rtol: float, step: float) -> dict[str, Any]:
-    """A function as the Chebyshev series by which a run represents it."""
-    end = wave.settled + wave.period if wave.period is not None else stop
-    # The run has warned of edges.
-    with warnings.catch_warnings(action="ignore"):
-        table = source_table(wave, 0.0, end, min(1e-3, max(0.05 * rtol, 1e-14)), step)
-    breaks = wave.breakpoints(0.0, end)
-    return {
-        "kind": "Function", "name": getattr(getattr(wave, "function", None), "__name__", ""), "repeat": wave.period,
-        "breaks": breaks[breaks < end].tolist(), "edges": table.edges, "series": table.series,
-    }  # fmt: skip
 
 
 def made_again(kept: Mapping[str, Any], arrays: list[FloatArray]) -> Circuit:

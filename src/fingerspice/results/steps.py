@@ -187,8 +187,7 @@ class ClosedForm:
     look: Callable[[FloatArray, BoolArray], Record]
     waveform: Waveform  # Waveform with the breakpoints of all sources
     t_start: float  # Start of the run, s
-    # Error of the records of `look`, relative to the peaks; the panels' polynomials need not be more accurate
-    error: float = 0.0
+    error: float = 0.0  # Of the records of `look`, relative to the peaks; the polynomials need not be more accurate
     rounding: float = 0.0  # Round-off of a voltage, V, below which the polynomials need not be accurate
 
     def run(self, names: Sequence[str], since: float, until: float) -> Recorded | None:
@@ -268,10 +267,9 @@ _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 *
 class Weighed:
     """Values of a signal with quadrature weights."""
 
-    # t, weight, x (n,): Times (s), weights whose sum is 1, and the signal in its unit
-    t: FloatArray
-    weight: FloatArray
-    x: FloatArray
+    t: FloatArray  # (n,): s
+    weight: FloatArray  # (n,): Their sum is 1
+    x: FloatArray  # (n,): In the signal's unit
 
     def mean(self, power: int = 1) -> float:
         """Mean of the signal, or of a power of it."""
