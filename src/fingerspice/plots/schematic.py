@@ -21,12 +21,12 @@ from matplotlib import image, rc_context
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Rectangle
 
-from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import waveform_text
 from fingerspice.plots import drawing
 from fingerspice.plots.picture import Picture
+from fingerspice.waveforms.waveform import refuse
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -223,8 +223,8 @@ class Schematic(Picture):
         path = Path(path)
         if path.suffix.lower() == ".png":
             return drawing.save(self, path, about=about, dpi=200.0)
-        if path.suffix.lower() != ".svg":
-            raise InputError(f"the schematic's file is {str(path)!r}; allowed: a name that ends in .svg or .png")
+        wrong = path.suffix.lower() != ".svg"
+        refuse(wrong, f"the schematic's file is {str(path)!r}; allowed: a name that ends in .svg or .png")
         return write_aside(path, lambda target: self._write_svg(target, about or {}))
 
 
@@ -248,9 +248,8 @@ def put_beside(picture: Figure, circuit: Circuit) -> Figure:
 
 def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     """The schematic of a circuit; arguments as in `Circuit.draw`."""
-    if len(circuit.elements) > MOST_ELEMENTS:
-        count = f"{len(circuit.elements):,}"
-        raise InputError(f"the circuit has {count} elements; allowed: at most {MOST_ELEMENTS} in a picture")
+    count, allowed = len(circuit.elements), f"at most {MOST_ELEMENTS} in a picture"
+    refuse(count > MOST_ELEMENTS, f"the circuit has {count:,} elements; allowed: {allowed}")
     figure, placed = Schematic(facecolor="white"), place(circuit)
     pairs = [pair for e in circuit.elements for pair in zip(e.nodes[:2], e.node_names[:2], strict=True)]
     names = {node: drawing.drawable(name, _LONGEST) for node, name in reversed(pairs) if node != _GROUND}

@@ -37,7 +37,7 @@ from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Recorded, whole_steps
 from fingerspice.waveforms import periodic, samples, waveform
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
-from fingerspice.waveforms.waveform import Fundamental, Waveform
+from fingerspice.waveforms.waveform import Fundamental, Waveform, refuse
 
 #: Name of the checksum, in the identity of a store; key of the checksum of a store's attributes among them.
 CHECKSUM, SIGNATURE = "crc32c", "checksum"
@@ -49,10 +49,8 @@ def zarr_library() -> Any:
     try:
         import zarr
     except ImportError:
-        raise InputError(
-            "a store is written as Zarr, and the package zarr is not installed; allowed: pip install "
-            "'fingerspice[stream]'"
-        ) from None
+        way = "pip install 'fingerspice[stream]'"
+        raise InputError(f"a store is written as Zarr, and the package zarr is not installed; allowed: {way}") from None
     return zarr
 
 
@@ -159,9 +157,8 @@ def check_store(path: Path) -> dict[str, int]:
         }
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path} is no whole store; allowed: one that --stream or --store wrote") from None
-    if codecs.count(CHECKSUM) < len(about):
-        raise InputError(f"{path} has no checksums, as an earlier version wrote it: a changed byte would not be seen; "
-                         "allowed: a store written anew")  # fmt: skip
+    told = "has no checksums, as an earlier version wrote it: a changed byte would not be seen"
+    refuse(codecs.count(CHECKSUM) < len(about), f"{path} {told}; allowed: a store written anew")
     found = {name: [file for file in (path / name / "c").rglob("*") if file.is_file()] for name in about}
     bad = [f"{path / 'zarr.json'} has changed"] if head.get(SIGNATURE, "") not in ("", signature(head)) else []
     for name, chunks in found.items():
@@ -299,12 +296,10 @@ def load(path: str | Path) -> Solution:
     import h5netcdf
 
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path} is not a file; {_ALLOWED}")
+    refuse(not path.is_file(), f"{path} is not a file; {_ALLOWED}")
     try:
         with h5netcdf.File(path, "r") as file:
-            if GROUP not in file.groups:
-                raise InputError(f"{path} is no run of fingerspice; {_ALLOWED}")
+            refuse(GROUP not in file.groups, f"{path} is no run of fingerspice; {_ALLOWED}")
             return _solution(file)
     except InputError:
         raise

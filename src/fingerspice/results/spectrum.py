@@ -21,7 +21,7 @@ from fingerspice.circuit.describe import NOTABLE, energy_outside
 from fingerspice.circuit.network import network_of
 from fingerspice.results.record import Sealed, signal_of
 from fingerspice.results.steps import Outputs
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -206,19 +206,14 @@ def _even_outputs(solution: Solution, name: str, since: float | None) -> tuple[F
     kept = np.append(np.diff(t) > 0.0, True)[: t.size] & (t >= (-math.inf if since is None else since))
     jump = np.append(False, np.diff(t) == 0.0)[: t.size][kept]
     t, x = t[kept], x[kept]
-    if t.size < _FEWEST:
-        raise InputError(
-            f"a density needs {_FEWEST} outputs or more, and there are {t.size}; allowed: a shorter step on the .tran "
-            "line, or more times in t_eval"
-        )
+    ways = "a shorter step on the .tran line, or more times in t_eval"
+    refuse(t.size < _FEWEST, f"a density needs {_FEWEST} outputs or more, and there are {t.size}; allowed: {ways}")
     place = (t - t[0]) / (t[-1] - t[0])
     place *= np.rint(1.0 / np.median(np.diff(place)))
     on = ~jump | (np.abs(place - np.rint(place)) <= _EVEN)
-    if np.any(np.abs(np.diff(place[on]) - 1.0) > _EVEN):
-        raise InputError(
-            "the outputs are not evenly spaced, and a density needs them so; allowed: the even outputs of the .tran "
-            "line's step, or even times in t_eval"
-        )
+    uneven = np.any(np.abs(np.diff(place[on]) - 1.0) > _EVEN)
+    ways = "the even outputs of the .tran line's step, or even times in t_eval"
+    refuse(uneven, f"the outputs are not evenly spaced, and a density needs them so; allowed: {ways}")
     return t[on], x[on]
 
 
