@@ -27,8 +27,7 @@ _KINDS = {
     "uniform": "[low, high]", "loguniform": "[low, high]", "normal": "[mean, standard deviation]",
     "lognormal": "[median, standard deviation of the logarithm]",
 }  # fmt: skip
-#: Largest number of messages about scenes without a result that are printed, and size of a sweep's file, bytes.
-_MOST_TOLD, _LARGEST = 8, 1 << 20
+_MOST_TOLD, _LARGEST = 8, 1 << 20  # Most messages about scenes without a result; bytes of a sweep's file
 
 
 def _report(job: Job, circuit: fs.Circuit, files: Mapping[str, str], make: Callable[[], Any], key: str = "") -> None:

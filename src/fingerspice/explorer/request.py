@@ -31,8 +31,7 @@ from fingerspice.waveforms.waveform import refuse, require
 _SPAN = 100.0  # A slider goes from the deck's value over this to its value times this, within the usual range
 _LINEAR = 12.0  # Ratio of the ends of a usual range up to which its slider is linear
 _LARGEST_VOLTAGE = 400.0
-#: Units whose values are written with SPICE's suffixes.
-_PREFIXED = ("m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m")
+_PREFIXED = ("m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m")  # Units of values with SPICE's suffixes
 
 
 def sliders(base: fs.Circuit, shown: fs.Circuit) -> list[dict[str, Any]]:

@@ -374,8 +374,7 @@ def means(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any
     }  # fmt: skip
 
 
-EXAMPLES = MENUS["scene"]
-"""The scenes of the menu, the first of which is shown at the start."""
+EXAMPLES = MENUS["scene"]  # The first of them is shown at the start
 
 
 def beginning(circuit: fs.Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:

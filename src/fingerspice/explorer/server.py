@@ -28,10 +28,8 @@ from fingerspice.explorer.request import asked_by
 from fingerspice.waveforms.waveform import require
 
 ADDRESS = "127.0.0.1"
-FRAME_HEIGHT, MOST_FRAMES = 900, 8
-"""Height (px) of the page in a notebook; explorers that one notebook keeps running."""
-#: Largest request, bytes; seconds that a connection may be silent; connections at once.
-MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32
+FRAME_HEIGHT, MOST_FRAMES = 900, 8  # Height (px) of the page in a notebook; explorers that one notebook keeps running
+MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32  # Bytes of a request; s of silence; connections at once
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 #: Pages that may show the explorer within them, where a notebook has asked for it: those of this computer.
 _NOTEBOOKS = " ".join(f"{kind}://{host}:*" for kind in ("http", "https") for host in (ADDRESS, "localhost"))
@@ -46,8 +44,7 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-#: Explorers that this notebook shows, the oldest first: a cell that is run again starts another one.
-_FRAMES: deque[Explorer] = deque()
+_FRAMES: deque[Explorer] = deque()  # Those that this notebook shows, oldest first: a cell run again starts another
 
 
 def pages() -> dict[str, bytes]:

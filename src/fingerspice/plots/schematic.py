@@ -134,8 +134,7 @@ def _place_columns(order: Sequence[tuple[Element, Element | None]], rows: Mappin
 
 
 Stroke = Sequence[tuple[float, float]]
-#: Half the height of a part, and half the distance of a resistor from the capacitor beside it.
-_HALF, _APART, _RADIUS = 0.24, 0.17, 0.17
+_HALF, _APART, _RADIUS = 0.24, 0.17, 0.17  # Half a part's height, and half a resistor's distance from its capacitor
 _ZIGZAG: Stroke = [(0.06 * (-1.0) ** k, 0.15 - 0.05 * (k + 0.5)) for k in range(6)]
 _RESISTOR: list[Stroke] = [[(0.0, _HALF), (0.0, 0.15), *_ZIGZAG, (0.0, -0.15), (0.0, -_HALF)]]
 _CAPACITOR: list[Stroke] = [
@@ -185,8 +184,7 @@ MOST_ELEMENTS = 200  # Largest number of elements that a picture can show
 _LETTERS, _LONGEST, _LINES = 34, 40, 7  # Letters in a line of values and in a name, and lines of values at most
 #: Inches: height of a line of text, from a symbol to its label, around everything, and around a label in its row.
 _LINE, _BESIDE, _MARGIN, _ROOM = 0.135, 0.08, 0.15, 0.1
-#: Largest size of a schematic beside a run's picture, and how low that picture may become beside it, over their own.
-_LARGE, _LEAST = 1.3, 0.8
+_LARGE, _LEAST = 1.3, 0.8  # Largest size of a schematic beside a picture, and least height of that, over their own
 _TINTS = {"LAYER": drawing.SKY, "SLAB": drawing.SKY, "SKIN": drawing.ORANGE, "SKIN_DISPERSIVE": drawing.ORANGE}
 
 

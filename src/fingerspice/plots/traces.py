@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 MOST_DRAWN, ZOOMED, _LOUD = 30, 4, 0.7
 _FEWEST = 12  # Smallest number of outputs in an oscillation for which its shape is visible
 _PARTS = 240  # An envelope divides the window into at most this many parts, each at least one oscillation long
-#: Number of letters for which a legend has room: across the page, and over the left one of two columns.
-_PAGE, _HALF = 90, 50
+_PAGE, _HALF = 90, 50  # Letters for which a legend has room: across the page, and over the left of two columns
 #: Line widths (points) in one panel: later lines are narrower and dashed, so that all stay visible where they coincide.
 _WIDTHS = (2.0, 1.5, 1.2, 1.0)
 #: A source is drawn wide and pale, and the other lines are drawn on top of it.
@@ -352,8 +351,7 @@ def about_all(runs: Sequence[Drawn]) -> str:
     return " · ".join([*(titles - set(shared) if len(titles) == 1 else ()), *shared, *own])
 
 
-#: Amplitudes below this fraction of the largest are not drawn: they are mostly numerical errors of the run.
-_DRAWN = 1e-6
+_DRAWN = 1e-6  # Amplitudes below this fraction of the largest are not drawn: they are mostly the run's errors
 
 
 def plot_spectrum(spectrum: Spectrum) -> Picture:

@@ -39,8 +39,7 @@ from fingerspice.waveforms import periodic, samples, waveform
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
 from fingerspice.waveforms.waveform import Fundamental, Waveform, refuse
 
-#: Name of the checksum, in the identity of a store; key of the checksum of a store's attributes among them.
-CHECKSUM, SIGNATURE = "crc32c", "checksum"
+CHECKSUM, SIGNATURE = "crc32c", "checksum"  # Name of the checksum in a store's identity; key of its attributes' own
 _SIZE = 4
 
 
@@ -188,8 +187,7 @@ def _fault(file: Path, size: int) -> str | None:
     return None if content[size:] == _checksum(content[:size]) else "has changed since it was written"
 
 
-#: Name of the NetCDF group with what `load` needs besides the variables, and the number of its format.
-GROUP, FORMAT = "fingerspice", 1
+GROUP, FORMAT = "fingerspice", 1  # The NetCDF group with what `load` needs besides the variables; its format
 _ALLOWED = "allowed: a NetCDF file that to_netcdf or the command wrote"
 MOST_NUMBERS = 8_000_000  # Largest number of a circuit's samples, points and coefficients that a file keeps (64 MB)
 _WAVEFORMS = {

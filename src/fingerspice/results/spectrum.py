@@ -35,8 +35,7 @@ _LINES, _MOST_LINES = 1000, 10_000  # Number of lines unless a highest frequency
 _FEWEST, _SEGMENTS = 64, 8
 _EVEN = 1e-5  # Largest deviation of output times from evenly spaced ones, relative to their distance
 CONFIDENCE = 0.95  # Probability that the interval of a density contains the true density
-#: Largest change of a signal over its last period, relative to its range, without a warning that it is not periodic.
-_CLOSED = 0.01
+_CLOSED = 0.01  # Largest change of a signal over its last period, over its range, without a warning about it
 _SHOWN = 12  # Number of lines in a report
 
 

@@ -29,10 +29,8 @@ Make = Callable[[FloatArray, BoolArray, FloatArray], Signals]
 #: to high as fractions of its length, and the duration (s), longer than the part itself if it stands for equal periods.
 Panels = FloatArray
 
-#: Most steps recorded by the compiled loop before Python collects them, and most numbers at their nodes.
-CAPACITY, _AT_ONCE = 512, 16_384
-#: Largest number of values kept of a run's steps (64 MB); figures of a longer run are computed from its outputs.
-MOST_NUMBERS = 8_000_000
+CAPACITY, _AT_ONCE = 512, 16_384  # Most steps, and numbers at their nodes, that the compiled loop records at once
+MOST_NUMBERS = 8_000_000  # Most values kept of a run's steps (64 MB); figures of a longer run are those of its outputs
 _KNOWN, _MOST_KNOWN = 8, 4096  # Sets of places between the steps whose record is kept, and the most places of one
 
 
@@ -172,11 +170,9 @@ def missed(x: FloatArray) -> FloatArray:
 
 
 _MISSED = 1e-11  # Largest interpolation error of a panel between its nodes, relative to the signal's peak
-#: Largest number of panels, beyond which figures are computed from the outputs; and of halvings of one panel.
-MOST_PANELS, _MOST_ROUNDS = 20_000, 60
+MOST_PANELS, _MOST_ROUNDS = 20_000, 60  # Most panels, beyond which figures are those of the outputs; and halvings
 _ROUNDINGS = 32.0  # Length of a panel that is a straight line at all events, in units of the last place of the time
-#: Most segments of the source that an evaluation may pass; length of the first panels in the source's shortest times.
-_MOST_PASSED, _LONGEST = 200_000, 0.5
+_MOST_PASSED, _LONGEST = 200_000, 0.5  # Most segments to pass; the first panels in the source's shortest times
 
 
 @dataclass(frozen=True)
