@@ -314,13 +314,13 @@ def figures(
     folder = (job.out or FOLDER) / ("gallery" if gallery else "")
     # The decks are those of `circuits` below the current folder.
     runs = shown_runs(Path("circuits")) if gallery else {}
-    drawn = {folder / f"{name}.png": run for name, run in runs.items()}
+    drawn = {folder / f"{name}.png": make for name, make in runs.items()}
     for file in drawn or [folder / f"fig{one}.{kind}" for one in only or FIGURES for kind in ("png", "csv")]:
         check_output(file)
     with paced("drawing") as update:
         files = [*drawn] or make_figures(folder, only=only, progress=update)
-        for i, (file, run) in enumerate(drawn.items(), 1):
-            draw(run, file)
+        for i, (file, make) in enumerate(drawn.items(), 1):
+            draw(make, file)
             update(i / len(drawn))
     job.answer.update(files=[*map(str, files)])
     job.give(str)

@@ -170,9 +170,9 @@ def missed(x: FloatArray) -> FloatArray:
 
 
 _MISSED = 1e-11  # Largest interpolation error of a panel between its nodes, relative to the signal's peak
-MOST_PANELS, _MOST_ROUNDS = 20_000, 60  # Most panels, beyond which figures are those of the outputs; and halvings
+MOST_PANELS, _MOST_ROUNDS = 20_000, 60  # Most panels, beyond which figures are those of the outputs; halvings of one
 _ROUNDINGS = 32.0  # Length of a panel that is a straight line at all events, in units of the last place of the time
-_MOST_PASSED, _LONGEST = 200_000, 0.5  # Most segments to pass; the first panels in the source's shortest times
+_MOST_PASSED, _LONGEST = 200_000, 0.5  # Segments an evaluation may pass; first panels, in the source's shortest times
 
 
 @dataclass(frozen=True)
