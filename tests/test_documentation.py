@@ -159,7 +159,7 @@ def test_the_gallery_has_every_deck_and_every_scene(monkeypatch: pytest.MonkeyPa
     assert all(f"]({name}.png)" in gallery.page() for name in entries)
     assert "where fingers feel best" in entries["click"].about
     for name in ("click", "scene-fold"):
-        gallery.draw(entries[name], tmp_path / f"{name}.png")
+        gallery.draw(entries[name].run, tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
     assert not entries["scene-fold"].run().success
 

@@ -23,7 +23,7 @@ from fingerspice.base.files import write_aside
 from fingerspice.cli import studies, terminal
 from fingerspice.cli.options import FOLDER, SETS, Job, Makes, add_command, area_from_text, check_output, with_times
 from fingerspice.cli.terminal import complain, outcome, say
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
@@ -102,15 +102,13 @@ def run(
     if stream or chunk or signals or netcdf:
         from fingerspice.cli.store import run_streamed
 
-        if not stream:
-            raise InputError("--chunk, --signals and --netcdf go with --stream")
+        refuse(not stream, "--chunk, --signals and --netcdf go with --stream")
         for option in [key for key, on in (("csv", csv), ("feel", feel), ("schematic", schematic)) if on]:
             raise InputError(f"--{option} does not go with --stream, which writes Zarr; allowed: --netcdf beside it")
         run_streamed(job, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
         return
     fingers: list[fs.Feel] = []
-    if feel and not circuit.by_device("GAP"):
-        raise InputError("--feel: the circuit has no GAP, so there is no friction to feel")
+    refuse(feel and not circuit.by_device("GAP"), "--feel: the circuit has no GAP, so there is no friction to feel")
     more = [end for end, on in (("_schematic.svg", schematic), ("_feel.png", feel)) if on]
     job.check_files(circuit, ".csv" if csv else ".nc", ".png", *more)
     with paced("simulating") as update:
@@ -178,11 +176,9 @@ def ac(
     except InputError as error:
         raise InputError(f"--sweep {error.message}") from None
     frequencies = sweep_frequencies(line)
-    if coupled and skin != "swept":
-        raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
+    refuse(coupled and skin != "swept", f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
     if amplitude:
-        if not coupled:
-            raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
+        refuse(not coupled, f"--amplitude goes with --area coupled, not with --area {area}")
         positive_row("amplitude", amplitude, "V")
     found: tuple[Any, ...] = ()
     if not coupled:
@@ -311,21 +307,20 @@ def figures(
       fingerspice figures --out out --only 4 --only 5
       fingerspice figures --gallery
     """
-    from fingerspice.explorer.scene import decks, draw, scenes
+    from fingerspice.explorer.scene import draw, shown_runs
     from fingerspice.studies.figures import FIGURES, make_figures
 
-    if gallery and only:
-        raise InputError("--only and --gallery are both given; allowed: one of them")
+    refuse(gallery and only, "--only and --gallery are both given; allowed: one of them")
     folder = (job.out or FOLDER) / ("gallery" if gallery else "")
     # The decks are those of `circuits` below the current folder.
-    entries = [*decks(Path("circuits")), *scenes()] if gallery else []
-    drawn = {folder / f"{one.name}.png": one for one in entries}
+    runs = shown_runs(Path("circuits")) if gallery else {}
+    drawn = {folder / f"{name}.png": make for name, make in runs.items()}
     for file in drawn or [folder / f"fig{one}.{kind}" for one in only or FIGURES for kind in ("png", "csv")]:
         check_output(file)
     with paced("drawing") as update:
         files = [*drawn] or make_figures(folder, only=only, progress=update)
-        for i, (file, one) in enumerate(drawn.items(), 1):
-            draw(one, file)
+        for i, (file, make) in enumerate(drawn.items(), 1):
+            draw(make, file)
             update(i / len(drawn))
     job.answer.update(files=[*map(str, files)])
     job.give(str)

@@ -27,7 +27,7 @@ from fingerspice.base.files import write_aside
 from fingerspice.base.units import parse_number
 from fingerspice.cli.terminal import blank, complain, outcome, say, say_json
 from fingerspice.results.outcome import SolveError
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 LARGEST_AREA = 0.01  # Largest area that causes no warning, m^2; a larger one was probably given in mm^2
 LONGEST_SOURCE = 1000  # Largest number of characters of a source's numbers that are stored with the results
@@ -232,20 +232,18 @@ def add_command(app: typer.Typer, options: str, function: Callable[..., Callable
         if then is not None:
             then()
 
-    taken = [_declared(known[key]) for key in options.split()]
+    taken = []
+    for one in (known[key] for key in options.split()):
+        # As typer takes it: an annotation has the help, and what stands for the value there.
+        kind, said, *value = get_args(one.annotation)
+        if isinstance(said, str):
+            # With its name a switch has no second option that switches it off.
+            said = Option(f"--{one.name.replace('_', '-')}", help=said, metavar=value[0] if value else None)
+        taken.append(one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, said]))
     # In the help an empty line keeps two lines apart.
     call.__doc__ = (inspect.getdoc(function) or "").replace("\n  fingerspice", "\n\n  fingerspice")
     call.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]
     app.command(name)(call)
-
-
-def _declared(one: inspect.Parameter) -> inspect.Parameter:
-    """A parameter as typer takes it: its annotation has its help, and what stands for its value there."""
-    kind, said, *value = get_args(one.annotation)
-    if isinstance(said, str):
-        # With its name a switch has no second option that switches it off.
-        said = Option(f"--{one.name.replace('_', '-')}", help=said, metavar=value[0] if value else None)
-    return one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, said])
 
 
 def _with_set(circuit: fs.Circuit, option: str, text: str) -> fs.Circuit:
@@ -262,8 +260,8 @@ def _with_values(circuit: fs.Circuit, changes: list[str], named: list[str]) -> f
     values: dict[str, str] = {}
     for change in (change for change in changes if change not in named):
         path, equals, text = (part.strip() for part in change.partition("="))
-        if not equals or not path:
-            raise InputError(f"--set {change!r} is not understood; allowed: PATH=VALUE, such as Xgap.d=3u")
+        allowed = "PATH=VALUE, such as Xgap.d=3u"
+        refuse(not (equals and path), f"--set {change!r} is not understood; allowed: {allowed}")
         values[path] = text
     try:
         return circuit.replace(values) if values else circuit
@@ -323,8 +321,7 @@ def with_times(circuit: fs.Circuit, stop: str | None, start: str = "deck") -> tu
     elif tran is None or (t_stop is None and t_start is None):
         return circuit, start
     first, last = tran.start if t_start is None else t_start, tran.stop if t_stop is None else t_stop
-    if last <= 0.0:
-        raise InputError(f"--stop {last:g} s; allowed: more than 0 s")
+    refuse(last <= 0.0, f"--stop {last:g} s; allowed: more than 0 s")
     if t_start is not None and not 0.0 <= first < last:
         raise InputError(f"--start {first:g} s; allowed: from 0 s to less than the end, {last:g} s")
     enough, least = last >= first + tran.step * (1.0 - 1e-12), f"TSTART + TSTEP = {first + tran.step:g} s or more"
@@ -362,17 +359,14 @@ def check_output(file: Path, deck: Path | None = None) -> None:
         # This raises OSError if a name is too long; the check needs a folder that exists.
         for name in file.relative_to(folder).parts:
             (folder / name).exists()
-        if not folder.is_dir():
-            raise InputError(f"cannot write {file}: {folder} is not a folder; {allowed}")
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise InputError(f"cannot write {file}: no permission in {folder}; {allowed}")
+        refuse(not folder.is_dir(), f"cannot write {file}: {folder} is not a folder; {allowed}")
+        refuse(not os.access(folder, os.W_OK | os.X_OK), f"cannot write {file}: no permission in {folder}; {allowed}")
         # Some folders, such as those of /proc, take nothing new whatever their permissions say.
         with tempfile.TemporaryFile(dir=folder):
             pass
-        if file.is_dir():
-            raise InputError(f"cannot write {file}: it is a folder; allowed: a file's name")
-        if deck is not None and file.exists() and deck.exists() and file.samefile(deck):
-            raise InputError(f"cannot write {file}: it is the deck itself; allowed: another name or folder")
+        refuse(file.is_dir(), f"cannot write {file}: it is a folder; allowed: a file's name")
+        same = deck is not None and file.exists() and deck.exists() and file.samefile(deck)
+        refuse(same, f"cannot write {file}: it is the deck itself; allowed: another name or folder")
     except OSError as error:
         raise InputError(f"cannot write {file}: {error.strerror}; {allowed}") from None
 

@@ -16,7 +16,7 @@ from fingerspice.base.announcing import paced
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.cli.options import Job, Makes, number
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 #: Keys of a sweep's file, and the arguments of `batch` among them.
 _KEYS = ("deck", "n", "seed", "indices", "outputs", "rtol", "t_stop", "periods", "periodic", "skin", "parameters")
@@ -27,8 +27,7 @@ _KINDS = {
     "uniform": "[low, high]", "loguniform": "[low, high]", "normal": "[mean, standard deviation]",
     "lognormal": "[median, standard deviation of the logarithm]",
 }  # fmt: skip
-#: Largest number of messages about scenes without a result that are printed, and size of a sweep's file, bytes.
-_MOST_TOLD, _LARGEST = 8, 1 << 20
+_MOST_TOLD, _LARGEST = 8, 1 << 20  # Most messages about scenes without a result; bytes of a sweep's file
 
 
 def _report(job: Job, circuit: fs.Circuit, files: Mapping[str, str], make: Callable[[], Any], key: str = "") -> None:
@@ -86,8 +85,7 @@ def limits(
     job.answer.update(charge_law=job.charge_law)
     circuit = job.read()
     if not capability:
-        if limit is not None or carrier is not None:
-            raise InputError("--limit and --carrier belong to --capability")
+        refuse(limit is not None or carrier is not None, "--limit and --carrier belong to --capability")
         study.grid_of(points, span)
     largest, tone = number("--limit", limit, positive=True), number("--carrier", carrier, positive=True)
     if capability and largest is None:
@@ -182,8 +180,7 @@ def sweep(
             require(given is None, f"--{option}", "given without --store", "--store OUT.zarr, too")
         job.check_files(circuit, ".nc", ".png")
     else:
-        if asked.get("indices"):
-            raise InputError(f"{file}: indices = true and --store are both given; allowed: one of them")
+        refuse(asked.get("indices"), f"{file}: indices = true and --store are both given; allowed: one of them")
         if (part := re.fullmatch("([0-9]+)/([0-9]+)", "1/1" if shard is None else shard)) is None:
             raise InputError(f"--shard is {shard!r}; allowed: two whole numbers such as 1/8")
         part_of = int(part[1]), int(part[2])
@@ -232,21 +229,20 @@ def _told(answer: dict[str, Any], found: Any) -> str:
 def _read(file: Path) -> tuple[dict[str, Any], Path]:
     """The file's keys, checked, and the deck."""
     try:
-        if file.stat().st_size > _LARGEST:
-            raise InputError(f"{file} has {file.stat().st_size:,} bytes; allowed: at most {_LARGEST:,}")
+        size = file.stat().st_size
+        refuse(size > _LARGEST, f"{file} has {size:,} bytes; allowed: at most {_LARGEST:,}")
         asked = tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeError, ValueError) as error:
         raise InputError(f"{file} cannot be read as TOML: {error}") from None
     for key in asked:
-        if key not in _KEYS:
-            raise InputError(f"{file}: unknown key {key!r}; allowed: {', '.join(_KEYS)}")
+        refuse(key not in _KEYS, f"{file}: unknown key {key!r}; allowed: {', '.join(_KEYS)}")
     for key, kind in (("deck", str), ("parameters", dict)):
         what = "the deck's file name" if key == "deck" else "a table such as [parameters] with Xgap.d = {...}"
         require(isinstance(asked.get(key), kind) and asked[key] != kind(), f"{file}: {key}", repr(asked.get(key)), what)
     folder = file.resolve().parent
     deck = (folder / asked["deck"]).resolve()
-    if not deck.is_relative_to(folder):
-        raise InputError(f"{file}: deck is {asked['deck']!r}; allowed: a file in the same folder or below it")
+    inside = deck.is_relative_to(folder)
+    require(inside, f"{file}: deck", repr(asked["deck"]), "a file in the same folder or below it")
     return asked, deck
 
 

@@ -28,13 +28,10 @@ from fingerspice.circuit.statespace import SLABS, count_of, driving_sources
 from fingerspice.netlist.netlist import source_from_text
 from fingerspice.waveforms.waveform import refuse, require
 
-#: A slider goes from the deck's value over this to its value times this, within the usual range.
-_SPAN = 100.0
-#: Ratio of the ends of a usual range up to which its slider is linear.
-_LINEAR = 12.0
+_SPAN = 100.0  # A slider goes from the deck's value over this to its value times this, within the usual range
+_LINEAR = 12.0  # Ratio of the ends of a usual range up to which its slider is linear
 _LARGEST_VOLTAGE = 400.0
-#: Units whose values are written with SPICE's suffixes.
-_PREFIXED = ("m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m")
+_PREFIXED = ("m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m")  # Units of values with SPICE's suffixes
 
 
 def sliders(base: fs.Circuit, shown: fs.Circuit) -> list[dict[str, Any]]:
@@ -104,8 +101,7 @@ def _of_waveform(name: str, unit: str, value: float) -> tuple[float, float, bool
 
 
 _NAMED = re.compile(r"(?:\s*([\w.]+)\s*=)?\s*(.*)", re.DOTALL)
-#: The source that stands for the file dropped on the page.
-RECORDING = "RECORDING"
+RECORDING = "RECORDING"  # The source that stands for the file dropped on the page
 _RECORDED = re.compile(rf"\s*{RECORDING}\s*\(([^()]*)\)\s*", re.IGNORECASE)
 
 
@@ -177,8 +173,7 @@ MOST_PERIODS, MOST_TIMES, MOST_BREAKPOINTS = 200.0, 2e5, 2e5
 #: between two jumps or samples.
 POINTS, MOST_POINTS = 2000, 12_000
 _OF_OSCILLATION, _OF_PIECE = 16, 2
-#: Most numbers of a recording: four seconds at 48 kHz.
-MOST_SAMPLES = 200_000
+MOST_SAMPLES = 200_000  # Most numbers of a recording: four seconds at 48 kHz
 _LARGEST = 1e300
 _AREAS = ("coupled", "mean", "frozen")
 #: Texts of a request with what is allowed and their largest length, words to choose from, and ranges of numbers.
@@ -301,20 +296,15 @@ class Asked:
 
     deck: str  # Text of the netlist
     overrides: Mapping[str, float] = MappingProxyType({})  # Path to value, in the netlist's unit
-    # Text of another source, ``SQUARE(200 100)`` or ``NAME=SQUARE(200 100)``; empty for the deck's own
-    source: str = ""
+    source: str = ""  # Another source, ``SQUARE(200 100)`` or ``NAME=SQUARE(200 100)``; empty for the deck's own
     charge_law: str | None = None  # None for the deck's own
     area: str | float = "coupled"  # As in `simulate`
-    # ``own``: the data of SKIN are taken at its f; ``follow``: at the source's fundamental; ``dispersive``: at all
-    # frequencies
-    skin: str = "own"
+    skin: str = "own"  # Data of SKIN: own, at its f; follow, at the fundamental; dispersive, at all frequencies
     rtol: float = 1e-6  # Largest error of gap voltage and force, relative to their peaks
-    # Length of the run in periods of the source; a source without a period runs to the deck's TSTOP
-    periods: float = 5.0
+    periods: float = 5.0  # Length of the run in periods of the source; without a period it runs to the deck's TSTOP
     last: float | None = None  # How many of the last periods are shown; None for all of the run
     recording: Recording | None = None  # The file dropped on the page, for the source ``RECORDING(gain)``
-    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they change
-    # nothing, and the page shows their caveats
+    # Named sets with commas, ``NAME`` or ``ELEMENT=NAME``, whose caveats the page shows; their values are given already
     sets: str = ""
 
     base: fs.Circuit  # The deck's
@@ -400,10 +390,8 @@ def _parsed(text: str) -> fs.Circuit:
 
 def _dispersive(circuit: fs.Circuit) -> fs.Circuit:
     """The circuit with the data of every skin at all frequencies."""
-    elements = list(circuit.elements)
-    for i, e in enumerate(elements):
-        if e.device == "SKIN":
-            elements[i] = replace(e, device="SKIN_DISPERSIVE", values=MappingProxyType({"d": e.values["d"]}))
+    wide = partial(replace, device="SKIN_DISPERSIVE")
+    elements = (wide(e, values={"d": e.values["d"]}) if e.device == "SKIN" else e for e in circuit.elements)
     return replace(circuit, elements=tuple(elements))
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,10 +26,8 @@ from fingerspice.plots.drawing import save
 from fingerspice.results.record import SIGNALS
 from fingerspice.waveforms.waveform import refuse
 
-#: Traces of each kind, and harmonics.
-MOST_TRACES, HARMONICS = 8, 20
-#: Longest time of a run after its compilation, s.
-LONGEST_RUN = 10.0
+MOST_TRACES, HARMONICS = 8, 20  # Traces of each kind, and harmonics
+LONGEST_RUN = 10.0  # Longest time of a run after its compilation, s
 _SHOWN = ("u_source", "u_gap", "f_el", "area", "friction")
 _WITHOUT_GAP = ("u_source", "u_layer", "v", "area")
 _FIGURES = ("mean", "max", "min", "mean_periodic")
@@ -275,10 +273,8 @@ def _changes(circuit: fs.Circuit, entry: str) -> tuple[str, str | None, dict[str
     return one.name, to or None, dict(one.apply(circuit, to or None).sets[one.name])
 
 
-#: Characters of an exported deck beyond which the page does not take it.
-_LONGEST_EXPORT = 20_000_000
-#: Largest error of the means against frequency: a picture shows no more.
-_RTOL = 1e-5
+_LONGEST_EXPORT = 20_000_000  # Characters of an exported deck beyond which the page does not take it
+_RTOL = 1e-5  # Largest error of the means against frequency: a picture shows no more
 _AS_CODE = re.compile(r"\b([A-Z][A-Za-z]*)\(")
 _DISPERSIVE = """\
 def dispersive(e):
@@ -378,8 +374,7 @@ def means(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any
     }  # fmt: skip
 
 
-EXAMPLES = MENUS["scene"]
-"""The scenes of the menu, the first of which is shown at the start."""
+EXAMPLES = MENUS["scene"]  # The first of them is shown at the start
 
 
 def beginning(circuit: fs.Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -393,45 +388,23 @@ def beginning(circuit: fs.Circuit | None, asked: Mapping[str, Any] | None = None
     return {"version": fs.__version__, "own": own, "examples": EXAMPLES, "waveforms": waveforms, "sets": sets}
 
 
-class Entry(NamedTuple):
-    """One picture of the gallery."""
+def shown_runs(folder: Path) -> dict[str, Callable[[], fs.Solution]]:
+    """What makes the runs of the gallery's pictures, by name: the decks of a folder, and the example scenes."""
 
-    name: str  # Of its file, without the suffix
-    # title, about: What it shows, in a line, and the comment of the deck or the note of the scene
-    title: str
-    about: str
-    origin: Path  # File that it is drawn from
-    run: Callable[[], fs.Solution]  # Runs it
+    def deck(path: Path) -> fs.Solution:
+        return fs.simulate(fs.read_netlist(path))
 
+    def example(request: dict[str, Any]) -> fs.Solution:
+        asked = Asked(request)
+        first, stop, _ = asked.times
+        t = np.linspace(first, stop, 4001)
+        return fs.simulate(asked.circuit, t_stop=stop, t_eval=t, charge_law=asked.charge_law, throw=False)
 
-def decks(folder: Path) -> Iterator[Entry]:
-    """The decks of a folder; their comments explain them."""
-    for path in sorted(folder.glob("*.cir")):
-        lines = path.read_text(encoding="utf-8").splitlines()
-        end = lines.index(".include fingerspice.lib") if ".include fingerspice.lib" in lines else len(lines)
-        comments = [line[1:].strip() for line in lines[1:end] if line[:1] == "*"]
-        about = re.split(r"Layers(?:,| and) contact|SI units|V\(area\)|In ngspice|Charge law:", " ".join(comments))[0]
-        title = re.sub(r"Fingerpad on a (3M-coated )?touchscreen,? (with )?", "", lines[0]) or path.stem
-        title = title[0].upper() + title[1:]
-        run = partial(lambda path: fs.simulate(fs.read_netlist(path)), path)
-        yield Entry(path.stem, title, about.strip(), path, run)
+    decks = {path.stem: partial(deck, path) for path in sorted(folder.glob("*.cir"))}
+    return {**decks, **{f"scene-{one['name']}": partial(example, one["request"]) for one in EXAMPLES}}
 
 
-def scenes() -> Iterator[Entry]:
-    """The example scenes of the explorer."""
-    menus = Path(__file__).with_name("menus.toml")
-    for one in EXAMPLES:
-        yield Entry(f"scene-{one['name']}", one["title"], one["note"], menus, partial(_run_scene, one["request"]))
-
-
-def _run_scene(request: dict[str, Any]) -> fs.Solution:
-    asked = Asked(request)
-    first, stop, _ = asked.times
-    t = np.linspace(first, stop, 4001)
-    return fs.simulate(asked.circuit, t_stop=stop, t_eval=t, charge_law=asked.charge_law, throw=False)
-
-
-def draw(entry: Entry, picture: Path) -> None:
-    """Run an entry, and draw source, gap voltage and friction."""
+def draw(run: Callable[[], fs.Solution], picture: Path) -> None:
+    """Draw source, gap voltage and friction of what `run` gives."""
     with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
-        save(entry.run().plot(("u_source", "u_gap", "f_t")), picture, dpi=110.0)
+        save(run().plot(("u_source", "u_gap", "f_t")), picture, dpi=110.0)

@@ -28,10 +28,8 @@ from fingerspice.explorer.request import asked_by
 from fingerspice.waveforms.waveform import require
 
 ADDRESS = "127.0.0.1"
-FRAME_HEIGHT, MOST_FRAMES = 900, 8
-"""Height (px) of the page in a notebook; explorers that one notebook keeps running."""
-#: Largest request, bytes; seconds that a connection may be silent; connections at once.
-MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32
+FRAME_HEIGHT, MOST_FRAMES = 900, 8  # Height (px) of the page in a notebook; explorers that one notebook keeps running
+MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32  # Bytes of a request; s of silence; connections at once
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 #: Pages that may show the explorer within them, where a notebook has asked for it: those of this computer.
 _NOTEBOOKS = " ".join(f"{kind}://{host}:*" for kind in ("http", "https") for host in (ADDRESS, "localhost"))
@@ -46,8 +44,7 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-#: Explorers that this notebook shows, the oldest first: a cell that is run again starts another one.
-_FRAMES: deque[Explorer] = deque()
+_FRAMES: deque[Explorer] = deque()  # Those that this notebook shows, oldest first: a cell run again starts another
 
 
 def pages() -> dict[str, bytes]:
@@ -155,6 +152,9 @@ class Explorer:
 def explore(shown: fs.Circuit | fs.Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
     """Show a circuit, or a run's circuit, on a local page on which its values can be changed (docs/explore.md).
 
+    The `Explorer` runs until its `stop` is called, or the program ends; `wait` lets a script wait for Ctrl-C. A
+    notebook keeps the latest eight that it shows.
+
     Parameters
     ----------
     shown : Circuit or Solution, optional
@@ -165,19 +165,12 @@ def explore(shown: fs.Circuit | fs.Solution | None = None, *, port: int = 0, bro
     browser : bool
         Whether the page is shown: in a notebook below the cell whose last line this is, and otherwise in the browser.
 
-    Returns
-    -------
-    Explorer
-        It runs until its `stop` is called, or the program ends; `wait` lets a script wait for Ctrl-C. A notebook keeps
-        the latest eight that it shows.
-
     Raises
     ------
     InputError
         If the port is taken, or no port number.
     """
-    asked = asked_by(shown) if isinstance(shown, fs.Solution) else {}
-    circuit = shown.circuit if isinstance(shown, fs.Solution) else shown
+    circuit, asked = (shown.circuit, asked_by(shown)) if isinstance(shown, fs.Solution) else (shown, {})
     framed = browser and in_notebook()
     explorer = Explorer(circuit, port, asked=asked, framed=framed)
     if framed:

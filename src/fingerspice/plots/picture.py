@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import DataArray, Dataset
 
-#: Resolution (dots per inch) of the picture in a notebook, and the factor by which the notebook scales it down.
-_DPI, _SHARPER = 200, 2
+_DPI, _SHARPER = 200, 2  # Dots per inch of a notebook's picture, and the factor by which the notebook scales it down
 
 
 class Picture(Figure):
@@ -81,9 +80,8 @@ class Picture(Figure):
         # Of a backend that opens windows, the manager has one of these methods of its own.
         own, plain = canvas.manager_class, FigureManagerBase
         if all(getattr(own, x).__func__ is getattr(plain, x).__func__ for x in ("pyplot_show", "start_main_loop")):
-            raise InputError(
-                f"no window can be opened here (matplotlib's backend is {backend}); allowed: savefig('picture.png')"
-            )
+            problem = f"no window can be opened here (matplotlib's backend is {backend})"
+            raise InputError(f"{problem}; allowed: savefig('picture.png')")
         # These are the steps of pyplot: matplotlib has no public function that opens a window for a given figure.
         manager = canvas.new_manager(self, max(pyplot.get_fignums(), default=0) + 1)
         Gcf._set_new_active_manager(manager)

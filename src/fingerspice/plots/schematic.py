@@ -21,12 +21,12 @@ from matplotlib import image, rc_context
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Rectangle
 
-from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import waveform_text
 from fingerspice.plots import drawing
 from fingerspice.plots.picture import Picture
+from fingerspice.waveforms.waveform import refuse
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -134,8 +134,7 @@ def _place_columns(order: Sequence[tuple[Element, Element | None]], rows: Mappin
 
 
 Stroke = Sequence[tuple[float, float]]
-#: Half the height of a part, and half the distance of a resistor from the capacitor beside it.
-_HALF, _APART, _RADIUS = 0.24, 0.17, 0.17
+_HALF, _APART, _RADIUS = 0.24, 0.17, 0.17  # Half a part's height, and half a resistor's distance from its capacitor
 _ZIGZAG: Stroke = [(0.06 * (-1.0) ** k, 0.15 - 0.05 * (k + 0.5)) for k in range(6)]
 _RESISTOR: list[Stroke] = [[(0.0, _HALF), (0.0, 0.15), *_ZIGZAG, (0.0, -0.15), (0.0, -_HALF)]]
 _CAPACITOR: list[Stroke] = [
@@ -185,8 +184,7 @@ MOST_ELEMENTS = 200  # Largest number of elements that a picture can show
 _LETTERS, _LONGEST, _LINES = 34, 40, 7  # Letters in a line of values and in a name, and lines of values at most
 #: Inches: height of a line of text, from a symbol to its label, around everything, and around a label in its row.
 _LINE, _BESIDE, _MARGIN, _ROOM = 0.135, 0.08, 0.15, 0.1
-#: Largest size of a schematic beside a run's picture, and how low that picture may become beside it, over their own.
-_LARGE, _LEAST = 1.3, 0.8
+_LARGE, _LEAST = 1.3, 0.8  # Largest size of a schematic beside a picture, and least height of that, over their own
 _TINTS = {"LAYER": drawing.SKY, "SLAB": drawing.SKY, "SKIN": drawing.ORANGE, "SKIN_DISPERSIVE": drawing.ORANGE}
 
 
@@ -223,8 +221,8 @@ class Schematic(Picture):
         path = Path(path)
         if path.suffix.lower() == ".png":
             return drawing.save(self, path, about=about, dpi=200.0)
-        if path.suffix.lower() != ".svg":
-            raise InputError(f"the schematic's file is {str(path)!r}; allowed: a name that ends in .svg or .png")
+        wrong = path.suffix.lower() != ".svg"
+        refuse(wrong, f"the schematic's file is {str(path)!r}; allowed: a name that ends in .svg or .png")
         return write_aside(path, lambda target: self._write_svg(target, about or {}))
 
 
@@ -248,9 +246,8 @@ def put_beside(picture: Figure, circuit: Circuit) -> Figure:
 
 def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     """The schematic of a circuit; arguments as in `Circuit.draw`."""
-    if len(circuit.elements) > MOST_ELEMENTS:
-        count = f"{len(circuit.elements):,}"
-        raise InputError(f"the circuit has {count} elements; allowed: at most {MOST_ELEMENTS} in a picture")
+    count, allowed = len(circuit.elements), f"at most {MOST_ELEMENTS} in a picture"
+    refuse(count > MOST_ELEMENTS, f"the circuit has {count:,} elements; allowed: {allowed}")
     figure, placed = Schematic(facecolor="white"), place(circuit)
     pairs = [pair for e in circuit.elements for pair in zip(e.nodes[:2], e.node_names[:2], strict=True)]
     names = {node: drawing.drawable(name, _LONGEST) for node, name in reversed(pairs) if node != _GROUND}

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 MOST_DRAWN, ZOOMED, _LOUD = 30, 4, 0.7
 _FEWEST = 12  # Smallest number of outputs in an oscillation for which its shape is visible
 _PARTS = 240  # An envelope divides the window into at most this many parts, each at least one oscillation long
-#: Number of letters for which a legend has room: across the page, and over the left one of two columns.
-_PAGE, _HALF = 90, 50
+_PAGE, _HALF = 90, 50  # Letters for which a legend has room: across the page, and over the left of two columns
 #: Line widths (points) in one panel: later lines are narrower and dashed, so that all stay visible where they coincide.
 _WIDTHS = (2.0, 1.5, 1.2, 1.0)
 #: A source is drawn wide and pale, and the other lines are drawn on top of it.
@@ -77,8 +76,13 @@ def plot_solution(solution: Solution, signals: Any = None, window: Any = None, o
         for trace in traces if zoomed is not None else ():
             _draw_line(last, trace._replace(label="_"), factor, *spans[-1], time_unit(runs)[0])
         if keys == ["f_el"] and len(traces) == 1:
+            mean, of = traces[0].solution.f_el_mean_periodic, "the last period"
+            if mean is None:
+                mean, of = traces[0].solution.f_el_mean, "the run"
             for ax in (first, *enlarged):
-                _draw_mean(ax, traces[0], factor, unit, told=ax is last)
+                if mean is not None:
+                    label = f"mean of {of}, {factor * mean:.4g} {unit}" if ax is last else "_"
+                    ax.axhline(factor * mean, c=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
             if enlarged:
                 drawing.legend_above(last, 1)
         finish_panel(first, keys, traces, factor, unit, _HALF if enlarged else _PAGE)
@@ -276,15 +280,6 @@ def _draw_line(
     ax.plot(t, high, **edge, label=trace.label)
 
 
-def _draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
-    """Draw the mean force as a horizontal line; with `told` the legend names it."""
-    for kind, of in (("f_el_mean_periodic", "of the last period"), ("f_el_mean", "of the run")):
-        if (mean := trace.solution.summary().get(kind)) is not None:
-            label = f"mean {of}, {factor * mean:.4g} {unit}" if told else "_"
-            ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
-            break
-
-
 def finish_panel(
     ax: Axes, keys: Sequence[str], traces: Sequence[Trace], factor: float, unit: str, room: int = _PAGE
 ) -> None:
@@ -356,8 +351,7 @@ def about_all(runs: Sequence[Drawn]) -> str:
     return " · ".join([*(titles - set(shared) if len(titles) == 1 else ()), *shared, *own])
 
 
-#: Amplitudes below this fraction of the largest are not drawn: they are mostly numerical errors of the run.
-_DRAWN = 1e-6
+_DRAWN = 1e-6  # Amplitudes below this fraction of the largest are not drawn: they are mostly the run's errors
 
 
 def plot_spectrum(spectrum: Spectrum) -> Picture:

@@ -164,11 +164,9 @@ class State:
     """Where a run stopped; another run may start from it."""
 
     t: float  # s
-    # (n,): Live voltages (V), areas with a time constant (relative to their values at 0 V), charges delivered (C)
-    y: FloatArray
+    y: FloatArray  # (n,): Live voltages (V), areas with a time constant (over those at 0 V), charges delivered (C)
     s_before: FloatArray  # (n_source,): Source values just before `t`, V or A
-    # (n_area,): Branch of each area: the sign of its gap's voltage, or 0 if it is to be chosen from the voltage
-    sign: FloatArray
+    sign: FloatArray  # (n_area,): Branch of each area: the sign of its gap's voltage, or 0 if that is to choose it
     charge_law: str
 
     def __repr__(self) -> str:

@@ -92,13 +92,9 @@ class Signals(Sealed):
     layers: tuple[str, ...]  # Names of the layers, in the order of `u_layer`
     node_voltages: dict[str, FloatArray]
 
-    @property
-    def gaps(self) -> tuple[str, ...]:
-        """Names of the GAPs."""
-        return tuple(name for name, _ in self.fingers)
+    gaps = cached_property(lambda self: tuple(name for name, _ in self.fingers))  # Names of the GAPs
 
     def _of_gaps(self, key: str, make: Callable[[Contact, FloatArray], FloatArray]) -> FloatArray | None:
-        """A signal that follows from another one of the same gap, with its contact."""
         return side_by_side([make(own[1], x) for own, x in zip(self.fingers, self.each(key), strict=True)])
 
     sigma_el = cached_property(lambda self: self._of_gaps("u_gap", Contact.stress))
@@ -174,22 +170,16 @@ class Signalled:
     node_voltages: dict[str, FloatArray] = _given("node_voltages", "Node name to its voltage, V, shape (n_t,).")
     u_source: FloatArray = _given("u_source", "Voltage of each source, V, shape (n_t,); of a series stack the loop's.")
     u_layer: FloatArray = _given("u_layer", "Voltage of each layer from its p to its n node, V, shape (n_t, n_layer).")
-    fold_margin: FloatArray = _given(
-        "fold_margin", "Distance to the fold of the `mobile` law: 1 without stored charge and under `local`, 0 at it."
-    )
+    fold_margin: FloatArray = _given("fold_margin", "Distance to the fold: 0 at it, and 1 without stored charge.")
     area: FloatArray | None = _given("area", "Ridge contact area, m^2, shape (n_t,); None for a circuit without any.")
     q_source: FloatArray | None = _given(
         "q_source",
         "Charge delivered by the source since the start, C, shape (n_t,), with the impulses at jumps.\n\n"
         "None where the run was asked to leave it out.",
     )
-    i_source: FloatArray | None = _given(
-        "i_source", "Current of the source, A, shape (n_t,), without the impulses at jumps, which `q_source` has."
-    )
+    i_source: FloatArray | None = _given("i_source", "Source current, A, shape (n_t,), without the impulses at jumps.")
     u_gap: FloatArray | None = _given("u_gap", "Gap voltage, V, shape (n_t,); None for a circuit without GAP.")
-    sigma_el: FloatArray | None = _given(
-        "sigma_el", "Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP."
-    )
+    sigma_el: FloatArray | None = _given("sigma_el", "Electroadhesive stress (Eq. 2), Pa; otherwise as `u_gap`.")
     f_el: FloatArray | None = _given(
         "f_el",
         "Electroadhesive force, N, shape (n_t,); None for a circuit without GAP.\n\n"
@@ -198,9 +188,7 @@ class Signalled:
         "error of some per cent at 50 to 200 outputs per period.",
     )
     f_t: FloatArray | None = _given("f_t", "Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP.")
-    friction: FloatArray | None = _given(
-        "friction", "Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP."
-    )
+    friction: FloatArray | None = _given("friction", "Friction coefficient f_t / f_n; otherwise as `u_gap`.")
 
     def by_name(self, key: str) -> dict[str, FloatArray]:
         """A signal by its name, or the columns of several elements by ``name:element``.
@@ -324,14 +312,12 @@ class Record(Signals):
 
     @cached_property
     def u_layer(self) -> FloatArray:
-        """Layer voltages from p to n, V, shape (n_t, n_layer)."""
         cells = map(self.cell_voltage, range(len(self.network.cells)))
         table = np.column_stack([np.zeros((self.t.size, 0)), *cells])
         return read_only(np.einsum("tc,lc->tl", table, self.network.grouping))
 
     @cached_property
     def u_gap(self) -> FloatArray | None:
-        """Gap voltage, V."""
         return side_by_side([self.cell_voltage(gap) for gap in self.network.gaps if gap is not None])
 
     @cached_property
@@ -387,7 +373,6 @@ class Record(Signals):
 
     @cached_property
     def node_voltages(self) -> dict[str, FloatArray]:  # type: ignore[override]
-        """Voltage of every node against ground, V, shape (n_t,) each."""
         n = self._x.shape[1]
         rows = zip(self.network.node_names, self.network.nodes, strict=True)
         return {name: read_only(self._voltage(row[:n], row[n:])) for name, row in rows}

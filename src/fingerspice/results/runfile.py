@@ -37,10 +37,9 @@ from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Recorded, whole_steps
 from fingerspice.waveforms import periodic, samples, waveform
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
-from fingerspice.waveforms.waveform import Fundamental, Waveform
+from fingerspice.waveforms.waveform import Fundamental, Waveform, refuse
 
-#: Name of the checksum, in the identity of a store; key of the checksum of a store's attributes among them.
-CHECKSUM, SIGNATURE = "crc32c", "checksum"
+CHECKSUM, SIGNATURE = "crc32c", "checksum"  # Name of the checksum in a store's identity; key of its attributes' own
 _SIZE = 4
 
 
@@ -49,10 +48,8 @@ def zarr_library() -> Any:
     try:
         import zarr
     except ImportError:
-        raise InputError(
-            "a store is written as Zarr, and the package zarr is not installed; allowed: pip install "
-            "'fingerspice[stream]'"
-        ) from None
+        way = "pip install 'fingerspice[stream]'"
+        raise InputError(f"a store is written as Zarr, and the package zarr is not installed; allowed: {way}") from None
     return zarr
 
 
@@ -159,9 +156,8 @@ def check_store(path: Path) -> dict[str, int]:
         }
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path} is no whole store; allowed: one that --stream or --store wrote") from None
-    if codecs.count(CHECKSUM) < len(about):
-        raise InputError(f"{path} has no checksums, as an earlier version wrote it: a changed byte would not be seen; "
-                         "allowed: a store written anew")  # fmt: skip
+    told = "has no checksums, as an earlier version wrote it: a changed byte would not be seen"
+    refuse(codecs.count(CHECKSUM) < len(about), f"{path} {told}; allowed: a store written anew")
     found = {name: [file for file in (path / name / "c").rglob("*") if file.is_file()] for name in about}
     bad = [f"{path / 'zarr.json'} has changed"] if head.get(SIGNATURE, "") not in ("", signature(head)) else []
     for name, chunks in found.items():
@@ -191,8 +187,7 @@ def _fault(file: Path, size: int) -> str | None:
     return None if content[size:] == _checksum(content[:size]) else "has changed since it was written"
 
 
-#: Name of the NetCDF group with what `load` needs besides the variables, and the number of its format.
-GROUP, FORMAT = "fingerspice", 1
+GROUP, FORMAT = "fingerspice", 1  # The NetCDF group with what `load` needs besides the variables; its format
 _ALLOWED = "allowed: a NetCDF file that to_netcdf or the command wrote"
 MOST_NUMBERS = 8_000_000  # Largest number of a circuit's samples, points and coefficients that a file keeps (64 MB)
 _WAVEFORMS = {
@@ -270,8 +265,8 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
                 rows = [np.flatnonzero(~keep), *(x[~keep] for x, _, _ in solution.signals.values())]
                 tables["before"] = np.column_stack(rows)
             for name, table in tables.items():
-                own = ("jump", "signal") if name == "before" else (f"{name}_{axis}" for axis in range(table.ndim))
-                dimensions = tuple(own)
+                axes = tuple(f"{name}_{axis}" for axis in range(table.ndim))
+                dimensions = ("jump", "signal") if name == "before" else axes
                 group.dimensions.update(zip(dimensions, table.shape, strict=True))
                 group.create_variable(name, dimensions, dtype=float, data=table)
         write_pieces(target, content.getbuffer())
@@ -291,10 +286,6 @@ def load(path: str | Path) -> Solution:
     ----------
     path : str or Path
 
-    Returns
-    -------
-    Solution
-
     Raises
     ------
     InputError
@@ -303,12 +294,10 @@ def load(path: str | Path) -> Solution:
     import h5netcdf
 
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path} is not a file; {_ALLOWED}")
+    refuse(not path.is_file(), f"{path} is not a file; {_ALLOWED}")
     try:
         with h5netcdf.File(path, "r") as file:
-            if GROUP not in file.groups:
-                raise InputError(f"{path} is no run of fingerspice; {_ALLOWED}")
+            refuse(GROUP not in file.groups, f"{path} is no run of fingerspice; {_ALLOWED}")
             return _solution(file)
     except InputError:
         raise
@@ -361,9 +350,8 @@ def _circuit(file: Any, run: dict[str, Any]) -> Circuit:
     try:
         if isinstance(kept, str):
             raise ValueError(kept)
-        names = [f"circuit{k}" for k in range(int(run["arrays"]))]
-        made = made_again(kept, [np.asarray(group.variables[name][...], float) for name in names])
-        return made._with(text=_text(file.attrs["deck"]))
+        arrays = [np.asarray(group.variables[f"circuit{k}"][...], float) for k in range(int(run["arrays"]))]
+        return made_again(kept, arrays)._with(text=_text(file.attrs["deck"]))
     except (InputError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError) as error:
         told = f"the circuit of this run cannot be made again from its file ({error}); its elements are left out"
         warnings.warn(told, FingerspiceWarning, stacklevel=4)
@@ -385,7 +373,15 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
             if kind in _WAVEFORMS.values():
                 own = {"kind": kind.__name__} | {f.name: getattr(value, f.name) for f in fields(kind)}
             else:
-                own = _tabulated(value, stop, rtol, circuit.tran.step if circuit.tran else 1e-3 * stop)
+                end = stop if value.period is None else value.settled + value.period
+                step = circuit.tran.step if circuit.tran else 1e-3 * stop
+                # The run has warned of edges.
+                with warnings.catch_warnings(action="ignore"):
+                    table = source_table(value, 0.0, end, min(1e-3, max(0.05 * rtol, 1e-14)), step)
+                breaks = value.breakpoints(0.0, end)
+                name = getattr(getattr(value, "function", None), "__name__", "")
+                own = {"kind": "Function", "name": name, "repeat": value.period}
+                own |= {"breaks": breaks[breaks < end].tolist(), "edges": table.edges, "series": table.series}
             return {name: plain(x) for name, x in own.items()}
         if isinstance(value, tuple) and any(isinstance(x, Waveform) for x in value):
             return [plain(part) for part in value]
@@ -406,19 +402,6 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
     if count > MOST_NUMBERS:
         return f"its sources have {count:,} numbers, and a file keeps at most {MOST_NUMBERS:,}", []
     return kept, arrays
-
-
-def _tabulated(wave: Waveform, stop: float, rtol: float, step: float) -> dict[str, Any]:
-    """A function as the Chebyshev series by which a run represents it."""
-    end = wave.settled + wave.period if wave.period is not None else stop
-    # The run has warned of edges.
-    with warnings.catch_warnings(action="ignore"):
-        table = source_table(wave, 0.0, end, min(1e-3, max(0.05 * rtol, 1e-14)), step)
-    breaks = wave.breakpoints(0.0, end)
-    return {
-        "kind": "Function", "name": getattr(getattr(wave, "function", None), "__name__", ""), "repeat": wave.period,
-        "breaks": breaks[breaks < end].tolist(), "edges": table.edges, "series": table.series,
-    }  # fmt: skip
 
 
 def made_again(kept: Mapping[str, Any], arrays: list[FloatArray]) -> Circuit:

@@ -322,8 +322,8 @@ class Solution(Sealed, Shown, Signalled, Figured):
     ) -> Figure:  # fmt: skip
         """Draw signals against time: a notebook shows the figure, and from a script ``plot().show()`` opens a window.
 
-        More than about 30 oscillations are drawn as envelopes, and a second column shows the last few of them enlarged;
-        it also shows a short event enlarged.
+        ``plot().savefig("x.pdf")`` saves it. More than about 30 oscillations are drawn as envelopes, and a second
+        column shows the last few of them enlarged; it also shows a short event enlarged.
 
         Parameters
         ----------
@@ -335,11 +335,6 @@ class Solution(Sealed, Shown, Signalled, Figured):
         others : Solution, sequence or mapping of str to Solution, optional
             Runs to draw over this one; without names they are called by the facts in which they differ.
 
-        Returns
-        -------
-        matplotlib.figure.Figure
-            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
-
         Raises
         ------
         InputError
@@ -350,13 +345,7 @@ class Solution(Sealed, Shown, Signalled, Figured):
         return plot_solution(self, signals, window, others)
 
     def explore(self) -> Any:
-        """Show the run's circuit on a local page as it was run, in a notebook below the cell (docs/explore.md).
-
-        Returns
-        -------
-        Explorer
-            The running page.
-        """
+        """Show the circuit as it was run on a local page, as `fs.explore` does, whose `Explorer` it gives."""
         from fingerspice.explorer.server import explore
 
         return explore(self)
@@ -374,11 +363,6 @@ class Solution(Sealed, Shown, Signalled, Figured):
             Derivatives of J by signals of the run, shape (n_t,): ``u_gap``, ``area``, ``f_el``, ``f_t``, ``friction``;
             and by its means, numbers: ``area_mean``, ``f_el_mean``, ``f_t_mean``, ``friction_mean``.
 
-        Returns
-        -------
-        SampleGradient
-            Shape (n_sample,), with the error stated.
-
         Raises
         ------
         InputError
@@ -393,10 +377,7 @@ class Solution(Sealed, Shown, Signalled, Figured):
     def cite(self) -> Citation:
         """What to cite for this run: the model's paper, the program, and the sets of parameters that were applied.
 
-        Returns
-        -------
-        Citation
-            ``print`` shows the text and the BibTeX, which is also in `Citation.bibtex`.
+        ``print`` shows the text and the BibTeX, which is also in `Citation.bibtex`.
         """
         from fingerspice.sets import cite
 

@@ -21,7 +21,7 @@ from fingerspice.circuit.describe import NOTABLE, energy_outside
 from fingerspice.circuit.network import network_of
 from fingerspice.results.record import Sealed, signal_of
 from fingerspice.results.steps import Outputs
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import refuse, require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,8 +35,7 @@ _LINES, _MOST_LINES = 1000, 10_000  # Number of lines unless a highest frequency
 _FEWEST, _SEGMENTS = 64, 8
 _EVEN = 1e-5  # Largest deviation of output times from evenly spaced ones, relative to their distance
 CONFIDENCE = 0.95  # Probability that the interval of a density contains the true density
-#: Largest change of a signal over its last period, relative to its range, without a warning that it is not periodic.
-_CLOSED = 0.01
+_CLOSED = 0.01  # Largest change of a signal over its last period, over its range, without a warning about it
 _SHOWN = 12  # Number of lines in a report
 
 
@@ -98,13 +97,7 @@ class Spectrum(Sealed, Shown):
         return Page([head, f"{lines}, {self.resolution:.4g} Hz apart, as of {self.segments:.3g} independent segments"])
 
     def plot(self) -> Figure:
-        """Draw the lines, or the density with its interval, against frequency.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
-        """
+        """Draw the lines, or the density with its interval, against frequency, as a figure like `Solution.plot`'s."""
         from fingerspice.plots.traces import plot_spectrum
 
         return plot_spectrum(self)
@@ -212,19 +205,14 @@ def _even_outputs(solution: Solution, name: str, since: float | None) -> tuple[F
     kept = np.append(np.diff(t) > 0.0, True)[: t.size] & (t >= (-math.inf if since is None else since))
     jump = np.append(False, np.diff(t) == 0.0)[: t.size][kept]
     t, x = t[kept], x[kept]
-    if t.size < _FEWEST:
-        raise InputError(
-            f"a density needs {_FEWEST} outputs or more, and there are {t.size}; allowed: a shorter step on the .tran "
-            "line, or more times in t_eval"
-        )
+    ways = "a shorter step on the .tran line, or more times in t_eval"
+    refuse(t.size < _FEWEST, f"a density needs {_FEWEST} outputs or more, and there are {t.size}; allowed: {ways}")
     place = (t - t[0]) / (t[-1] - t[0])
     place *= np.rint(1.0 / np.median(np.diff(place)))
     on = ~jump | (np.abs(place - np.rint(place)) <= _EVEN)
-    if np.any(np.abs(np.diff(place[on]) - 1.0) > _EVEN):
-        raise InputError(
-            "the outputs are not evenly spaced, and a density needs them so; allowed: the even outputs of the .tran "
-            "line's step, or even times in t_eval"
-        )
+    uneven = np.any(np.abs(np.diff(place[on]) - 1.0) > _EVEN)
+    ways = "the even outputs of the .tran line's step, or even times in t_eval"
+    refuse(uneven, f"the outputs are not evenly spaced, and a density needs them so; allowed: {ways}")
     return t[on], x[on]
 
 
@@ -287,8 +275,8 @@ class PhasorSolution(Shown):
         Remarks on how the sweep was made.
     warnings : tuple of str
         Warnings of extrapolation and of implausible results.
-    circuit : Circuit or None
-        The circuit of the sweep.
+    circuit : Circuit
+        Of the sweep.
     impedance : ndarray of complex or None
         Voltage of the source over its current, ohm; None for a large-signal sweep or several sources.
     nodes : tuple of str
@@ -305,11 +293,11 @@ class PhasorSolution(Shown):
     f_el_mean: FloatArray
     amplitude: float
     layers: tuple[str, ...]
-    phase: float = 0.0
-    drive: str = ""
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    circuit: Circuit | None = None
+    phase: float
+    drive: str
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+    circuit: Circuit
     impedance: ComplexArray | None = None
     nodes: tuple[str, ...] = ()
     v_nodes: ComplexArray | None = None
@@ -361,8 +349,6 @@ class PhasorSolution(Shown):
         """Gain, phase, mean force and area, or without GAP the node voltages, against frequency."""
         from fingerspice.plots.traces import plot_phasor
 
-        require(self.circuit is not None, "circuit", self.circuit, "a sweep that phasor or large_signal made")
-        assert self.circuit is not None
         return plot_phasor((self,), self.circuit)
 
 

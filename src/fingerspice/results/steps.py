@@ -29,10 +29,8 @@ Make = Callable[[FloatArray, BoolArray, FloatArray], Signals]
 #: to high as fractions of its length, and the duration (s), longer than the part itself if it stands for equal periods.
 Panels = FloatArray
 
-#: Most steps recorded by the compiled loop before Python collects them, and most numbers at their nodes.
-CAPACITY, _AT_ONCE = 512, 16_384
-#: Largest number of values kept of a run's steps (64 MB); figures of a longer run are computed from its outputs.
-MOST_NUMBERS = 8_000_000
+CAPACITY, _AT_ONCE = 512, 16_384  # Most steps, and numbers at their nodes, that the compiled loop records at once
+MOST_NUMBERS = 8_000_000  # Most values kept of a run's steps (64 MB); figures of a longer run are those of its outputs
 _KNOWN, _MOST_KNOWN = 8, 4096  # Sets of places between the steps whose record is kept, and the most places of one
 
 
@@ -172,11 +170,9 @@ def missed(x: FloatArray) -> FloatArray:
 
 
 _MISSED = 1e-11  # Largest interpolation error of a panel between its nodes, relative to the signal's peak
-#: Largest number of panels, beyond which figures are computed from the outputs; and of halvings of one panel.
-MOST_PANELS, _MOST_ROUNDS = 20_000, 60
+MOST_PANELS, _MOST_ROUNDS = 20_000, 60  # Most panels, beyond which figures are those of the outputs; halvings of one
 _ROUNDINGS = 32.0  # Length of a panel that is a straight line at all events, in units of the last place of the time
-#: Most segments of the source that an evaluation may pass; length of the first panels in the source's shortest times.
-_MOST_PASSED, _LONGEST = 200_000, 0.5
+_MOST_PASSED, _LONGEST = 200_000, 0.5  # Segments an evaluation may pass; first panels, in the source's shortest times
 
 
 @dataclass(frozen=True)
@@ -187,8 +183,7 @@ class ClosedForm:
     look: Callable[[FloatArray, BoolArray], Record]
     waveform: Waveform  # Waveform with the breakpoints of all sources
     t_start: float  # Start of the run, s
-    # Error of the records of `look`, relative to the peaks; the panels' polynomials need not be more accurate
-    error: float = 0.0
+    error: float = 0.0  # Of the records of `look`, relative to the peaks; the polynomials need not be more accurate
     rounding: float = 0.0  # Round-off of a voltage, V, below which the polynomials need not be accurate
 
     def run(self, names: Sequence[str], since: float, until: float) -> Recorded | None:
@@ -268,10 +263,9 @@ _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 *
 class Weighed:
     """Values of a signal with quadrature weights."""
 
-    # t, weight, x (n,): Times (s), weights whose sum is 1, and the signal in its unit
-    t: FloatArray
-    weight: FloatArray
-    x: FloatArray
+    t: FloatArray  # (n,): s
+    weight: FloatArray  # (n,): Their sum is 1
+    x: FloatArray  # (n,): In the signal's unit
 
     def mean(self, power: int = 1) -> float:
         """Mean of the signal, or of a power of it."""

@@ -216,22 +216,15 @@ class Figured:
     """
 
     f_el_mean = figure("f_el", "mean", "Mean electroadhesive force over the run, N.")
-    f_el_mean_periodic = figure(
-        "f_el", "mean_periodic", "Mean electroadhesive force over the source's last period, N; None without one."
-    )
+    f_el_mean_periodic = figure("f_el", "mean_periodic", "Mean of `f_el` over the last period, N; None without one.")
     f_el_peak = figure("f_el", "peak", "Largest electroadhesive force, N.")
     f_t_mean = figure("f_t", "mean", "Mean friction force over the run, N.")
-    f_t_mean_periodic = figure(
-        "f_t", "mean_periodic", "Mean friction force over the source's last period, N; None where the run holds none."
-    )
+    f_t_mean_periodic = figure("f_t", "mean_periodic", "Mean of `f_t` over the last period, N; None without one.")
     friction_mean = figure("friction", "mean", "Mean friction coefficient over the run.")
     area_mean = figure("area", "mean", "Mean ridge contact area over the run, m^2.")
     u_gap_peak = figure("u_gap", "peak", "Largest modulus of the gap voltage, V.")
     u_gap_rms = figure("u_gap", "rms", "Root of the mean square of the gap voltage over the run, V.")
     u_gap_amplitude = figure(
-        "u_gap", "amplitude",
-        "Amplitude of the gap voltage at the source's fundamental, over its last period, V; None without one.",
-    )  # fmt: skip
-    u_gap_phase_deg = figure(
-        "u_gap", "phase_deg", "Phase of the gap voltage at the source's fundamental, relative to a sine, degrees."
+        "u_gap", "amplitude", "Amplitude of `u_gap` at the fundamental, over the last period, V; None without one."
     )
+    u_gap_phase_deg = figure("u_gap", "phase_deg", "Phase of `u_gap` at the fundamental, relative to a sine, degrees.")
