@@ -226,7 +226,9 @@ def test_circuits_without_one_contact_are_refused(circuit: fs.Circuit) -> None:
     ):
         with pytest.raises(fs.InputError, match=said):
             fs.fit_contact(other, data)
-    name = two.by_device("GAP")[1].name
+    other_gap, name = (gap.name for gap in two.by_device("GAP"))
+    with pytest.raises(fs.InputError, match=f"parameters is '{other_gap.lower()}.alpha'; allowed: alpha, "):
+        fs.fit_contact(two, data, [f"{other_gap}.alpha"], finger=name)
     assert fs.fit_contact(two, data, finger=name).values[f"{name}.alpha"] == pytest.approx(48.0, rel=1e-6)
 
 

@@ -24,6 +24,7 @@ from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
 from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import driving_sources
+from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import REFUSED, batch, own_path
@@ -469,8 +470,10 @@ def _fitted(task: Task, starts: int) -> Fit:
     ends = [followed(task.residuals, task.box, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
     if best.objective >= NOT_FOUND:
-        said = "none of the starts can be run: there is no contact, no solution, or a value out of range"
-        raise InputError(f"{said}; allowed: a circuit that runs under the conditions of the data")
+        try:
+            task.compared(best.values)
+        except (InputError, SolveError) as refused:
+            raise InputError(f"none of the starts can be run: {refused}") from None
     freedom = best.residual.size - len(task.names)
     if data.sigma is None and data.t is None and data.signal != IMPEDANCE and freedom >= _CHOOSING:
         freedom -= 1

@@ -292,7 +292,7 @@ def fit_contact(
     heavy = DEVICES["GAP"].parameter("fn").unusual("the data's largest", float(loads.max()))
     if heavy is not None:
         warnings.warn(heavy, FingerspiceWarning, stacklevel=2)
-    names = _wanted(parameters, relations)
+    names = _wanted(parameters, relations, gap)
     # The smallest load lets any contact be that is one under some load; at rest friction takes nothing off it.
     begin = {f"{gap}.fn": float(loads.min())}
     begin |= {f"{gap}.c2": 0.0} if {one.kind for one in relations} <= {"area", "indentation"} else {}
@@ -339,7 +339,7 @@ def _gap(circuit: Circuit, finger: str | None) -> str:
     return name
 
 
-def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple[str, ...]:
+def _wanted(given: Sequence[str] | None, relations: Sequence[Relation], gap: str) -> tuple[str, ...]:
     """The parameters to fit, in the order of the netlist."""
     if given is None:
         kinds, loaded = {one.kind for one in relations}, any(one.kind.startswith("area") for one in relations)
@@ -347,7 +347,7 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
         return tuple(compress(PARAMETERS, (loaded, loaded, pressed, pressed, "f_t" in kinds, "area_sliding" in kinds)))
     known = ", ".join(PARAMETERS)
     require(bool(given) and not isinstance(given, str), "parameters", repr(given), f"a sequence of {known}")
-    bare = [name.rpartition(".")[2].lower() for name in given]
+    bare = [name.lower().removeprefix(f"{gap.lower()}.") for name in given]
     for name in bare:
         require(name in PARAMETERS, "parameters", repr(name), known)
         require(bare.count(name) == 1, name, "named twice", "once")
