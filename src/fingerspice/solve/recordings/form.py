@@ -238,8 +238,9 @@ def curves(
     """The polynomials of `Lanes` and what goes with them, up to the gap voltage `top` (V), and `LaneForm.missed` and
     `missed_bend`; None where no allowed degree is enough for errors of `rtol`."""
     tol = _AREA_SHARE * min(rtol, _COARSEST)
-    u = chebyshev.nodes(_POINTS, 0.0, top)
-    area = chebyshev.coefficients(1.0 / inverse_area_array(u, curve)[0])
+    at = series_of.chebpts1(_POINTS)
+    to_series, u = np.linalg.inv(series_of.chebvander(at, _POINTS - 1)), 0.5 * top * (at + 1.0)
+    area = to_series @ (1.0 / inverse_area_array(u, curve)[0])
     integral = series_of.chebint(area, lbnd=-1.0) * 0.5 * top
     # The range of xi ends where the gap voltage reaches `top`.
     xi_top = float(top + kappa * (integral.sum() - top / q0))
@@ -251,7 +252,7 @@ def curves(
         if np.abs(step).max() <= 1e-15 * top:
             break
         u = np.clip(u - step, 0.0, top)
-    inverse, bend = chebyshev.coefficients(1.0 / a), chebyshev.coefficients(n)
+    inverse, bend = to_series @ (1.0 / a), to_series @ n
     one, off_one = as_powers(inverse, tol * abs(float(inverse[0])))
     # N acts at full strength, on charges too: compared with the whole integral of A. In a stack no step needs it.
     of_bend = tol if kappa > 0.0 else max(1e-3 * tol, min(tol, 1e-13))
