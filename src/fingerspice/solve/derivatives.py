@@ -186,7 +186,7 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
 class _Intervals:
     """The intervals of a run between the samples of its source, its outputs, and the start of its means."""
 
-    def __init__(self, run: Solution) -> None:
+    def __init__(self, run: Solution, of: Mapping[str, ArrayLike]) -> None:
         self.run, self.problem = run, _problem(run, {})
         problem, rtol = self.problem, run.rtol
         if len(problem.network.fingers) != 1 or not problem.scene.coupled:
@@ -204,21 +204,19 @@ class _Intervals:
         if form is None:
             said = "this circuit is not followed sample by sample (docs/recordings.md)"
             raise InputError(f"{_ASKED}{said}; allowed: a circuit that is")
-        self.wave, self.form, self.m = wave, form, form.lanes.rates.size
+        self.wave, self.form, self.m, self.by = wave, form, form.lanes.rates.size, _weights(run, of)
         self.parts = _STEPS if rtol >= _COARSE else _STEPS[1:]
-
-    def _divide(self, by: Mapping[str, Any]) -> None:
-        """Make the intervals, for the outputs that count."""
-        run, wave, t0, t1 = self.run, self.wave, self.problem.t_start, self.problem.t_stop
+        t0, t1, self.slack = problem.t_start, problem.t_stop, 1e-6 / wave.rate
         first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
-        more, self.slack = np.append(run.t[np.any([by[name] for name in DERIVED], axis=0)], run.first), 1e-6 / wave.rate
+        # Only the outputs that count.
+        more = np.append(run.t[np.any([self.by[name] for name in DERIVED], axis=0)], run.first)
         more = more[np.abs((more - wave.start) * wave.rate % 1.0 - 0.5) < 0.5 - 1e-6]
         t = np.unique(np.concatenate([wave.start + np.arange(first, last + 1) / wave.rate, more]))
         t = np.concatenate([[t0], t[(t > t0 + self.slack) & (t < t1 - self.slack)], [t1]])
         # (n + 1,): Start and end of the run, and samples and outputs between, s
         self.t = t[np.append(True, np.diff(t) > self.slack)]
         # (n + 1,): The source at these times
-        self.x, h = np.ascontiguousarray(self.problem.network.waveform.value(self.t)), np.diff(self.t)
+        self.x, h = np.ascontiguousarray(problem.network.waveform.value(self.t)), np.diff(self.t)
         # Lengths of the intervals (n,), or their common one (1,), s
         self.h = h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
 
@@ -259,9 +257,9 @@ class _Intervals:
             wanted[..., still] = rows[:, None, None] & off
         return [np.where(zero, coarse, fine), fine + (fine - coarse) / 7.0]
 
-    def outputs(self, by: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+    def outputs(self) -> tuple[FloatArray, FloatArray]:
         """Derivatives of a number, by its outputs, by the modes (m, n + 1) and the source (n + 1,) at all times."""
-        m, run, stack = self.m, self.run, self.problem.network.stack
+        m, run, by, stack = self.m, self.run, self.by, self.problem.network.stack
         ((_, contact),) = run.record.fingers
         assert run.u_gap is not None
         # By the gap voltage along the loop.
@@ -280,10 +278,9 @@ class _Intervals:
             np.add.at(of_source, at, of_gap[m] + of_gap[m + 1])
         return of_modes, of_source
 
-    def swept(self, by: Mapping[str, Any]) -> FloatArray:
+    def swept(self) -> FloatArray:
         """Derivatives of a number by the samples, with half the steps and with all, shape (2, n_sample)."""
-        self._divide(by)
-        t, m, wave, form, ((_, contact),) = self.t, self.m, self.wave, self.form, self.run.record.fingers
+        t, m, by, wave, form, ((_, contact),) = self.t, self.m, self.by, self.wave, self.form, self.run.record.fingers
         block, start = Block(form, self.x, self.h, True), form.start(self.problem)[0][:m]
         peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
         solved = block.solve(start, self.parts[2], _CLOSED * peak) and block.on_one_branch
@@ -296,7 +293,7 @@ class _Intervals:
         self.z, self.xi = np.column_stack([starts, block.end()[:m]]), block.xi.copy()
         sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
         self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
-        of_modes, by_outputs = self.outputs(by)
+        of_modes, by_outputs = self.outputs()
         n, means = t.size - 1, np.zeros((MORE, t.size - 1))
         of_source, after = np.tile(by_outputs, (2, 1)), np.tile(of_modes[:, n], (2, 1))
         means[SQUARES], means[AREAS] = by["f_el_mean"] * contact.stress(1.0), by["area_mean"]
@@ -317,9 +314,9 @@ class _Intervals:
         out, place = np.zeros((2, wave.count)), np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)
         first = np.minimum(np.floor(place + 1e-6), wave.count - 2.0).astype(np.int64)
         beyond = np.maximum(place - first, 0.0)
-        for row in range(2):
-            np.add.at(out[row], first, (1.0 - beyond) * of_source[row])
-            np.add.at(out[row], np.minimum(first + 1, wave.count - 1), beyond * of_source[row])
+        for samples, found in zip(out, of_source, strict=True):
+            np.add.at(samples, first, (1.0 - beyond) * found)
+            np.add.at(samples, np.minimum(first + 1, wave.count - 1), beyond * found)
         return out
 
 
@@ -341,8 +338,8 @@ def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradien
         allowed = "a run just made from its circuit's own start"
         raise InputError(f"{_ASKED}the run goes on from another one or was read from a file; allowed: {allowed}")
     refuse(run.failure is not None, f"{_ASKED}the run failed; allowed: a run to its end")
-    one = _Intervals(run)
-    coarse, fine = one.swept(_weights(run, of))
+    one = _Intervals(run, of)
+    coarse, fine = one.swept()
     largest = float(np.abs(fine).max())
     error = float(np.abs(fine - coarse).max()) + run.rtol * largest
     if error > _ALLOWED * run.rtol * largest:
