@@ -11,7 +11,6 @@ m = 0, or comes to rest there.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -69,8 +68,15 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
             z_end = flow(np.array([end]), last)[0][0]
     y = np.concatenate([last.x(modes)[0], z_end])
     state = State(end, y, last.s[0], np.zeros(area.size), scene.charge_law)
-    run = _finished(problem, tables, rows, state, bound, partial(solve_linear, area=None if at_once else area))
+    status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
+    run = Run(problem.t_out[: len(rows)], problem.left[: len(rows)], rows, status, 0, {}, state)
+    run.t_failed, run.unseen, run.rough = tables.not_finite, tables.unseen, tables.rough
     run.charge_error = charge_error
+    _state_errors(problem, run, bound)
+    if not scene.is_sampled:
+        # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
+        again = partial(solve_linear, area=None if at_once else area)
+        run.continuous = closed_form(replace(problem, charge=False), again)
     return run
 
 
@@ -133,9 +139,8 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
     wave, t_out = problem.network.waveform, problem.t_out
     if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
         return None
-    if wave.start != problem.t_start or t_out[-1] < problem.t_stop * (1.0 - 1e-12):
-        return None
-    if not on_grid(t_out, wave.start, 1.0 / wave.rate, same_time(problem.t_stop)):
+    whole = wave.start == problem.t_start and t_out[-1] >= problem.t_stop * (1.0 - 1e-12)
+    if not (whole and on_grid(t_out, wave.start, 1.0 / wave.rate, same_time(problem.t_stop))):
         return None
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
     u, rates, gains = wave.values[:count], modes.rates, np.ascontiguousarray(modes.gains[:, 0])
@@ -166,17 +171,11 @@ def _charge(
     return [charge, current]
 
 
-def _finished(
-    problem: Problem, tables: Tables, rows: FloatArray, state: State, bound: float, again: Callable[[Problem], Run]
-) -> Run:
-    """A run with its peaks and its stated errors: round-off, and `bound` relative to the peaks."""
-    status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
-    t, left = problem.t_out[: len(rows)], problem.left[: len(rows)]
-    run = Run(t, left, rows, status, 0, {}, state, t_failed=tables.not_finite)
-    run.unseen, run.rough = tables.unseen, tables.rough
+def _state_errors(problem: Problem, run: Run, bound: float) -> None:
+    """Peaks and stated errors of a run: round-off, and `bound` relative to the peaks."""
     largest = max(problem.largest, problem.scene.u_size)
     if problem.network.n_voltage < len(problem.network.sources):
-        largest = max(largest, float(np.abs(rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
+        largest = max(largest, float(np.abs(run.rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
     rounding = (ROUNDING_OF_MATRICES if problem.network.stack is None else ROUNDING) * largest
     gaps, record = [], run.record(problem)
     for i, u in enumerate(record.each("u_gap")):
@@ -192,10 +191,6 @@ def _finished(
         peak = max((float(np.abs(u).max(initial=0.0)) for u, _ in gap_signals(record)), default=0.0)
         gaps = [(peak, 0.0, rounding + bound * peak, 0.0)]
     run.gaps, run.node_error = np.array(gaps), rounding + bound * largest
-    if not problem.scene.is_sampled:
-        # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
-        run.continuous = closed_form(replace(problem, charge=False), again)
-    return run
 
 
 def _loop_charge(problem: Problem, answer: _Answer) -> tuple[FloatArray, FloatArray, float]:
@@ -279,14 +274,10 @@ class _Path(NamedTuple):
     """State (n + 1,), time since `begin` (s) and gap voltage (V) as functions of the variable s, up to the fold."""
 
     begin: float
+    t: float  # Time of the fold, s
     sources: Sources
     scale: FloatArray
     solution: Any  # An `OdeSolution` of scipy
-
-    @property
-    def t(self) -> float:
-        """Time of the fold, s."""
-        return self.begin + float(self.solution(self.solution.t_max)[-2] * self.scale[-2])
 
     def outputs(self, problem: Problem, t: FloatArray) -> tuple[list[FloatArray], FloatArray, State]:
         """Rows as in `Record`, gap voltages along the loop (V) and the last state, at times t (s) on the path."""
@@ -387,4 +378,4 @@ def _path(problem: Problem, t: float, y: FloatArray, sources: Sources, u: float,
     missed = last[n + 1] - model.k_gap * s[0] - model.area0 * q * dot(model.gap, last[:n])
     if abs(missed) > STRAYED * abs(last[n + 1]):
         raise _LostError
-    return _Path(t, sources, scale, found.sol)
+    return _Path(t, t + float(last[n]), sources, scale, found.sol)

@@ -382,23 +382,18 @@ def ready(problem: Problem, rtol: float) -> LaneForm | None:
 def _points(problem: Problem, wave: PWL) -> FloatArray:
     """Times (s) of a run's points and ends, and more on long lines, kept for the last run; empty if not dense."""
     t0, t1 = problem.t_start, problem.t_stop
-    return wave.remember(("points", t0, t1), lambda: _dense(wave.knots[0], t0, t1), 1)
 
+    def dense() -> FloatArray:
+        t, slack = wave.knots[0], 1e-6 * (t1 - t0) / wave.knots[0].size
+        inside = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
+        intervals = np.diff(inside)
+        if inside.size < LEAST_POINTS or not np.all(intervals > 0.0):
+            return np.empty(0)
+        parts = np.cumsum(np.append(0.0, np.ceil(intervals / (LONGEST * np.median(intervals)))))
+        few = parts[-1] <= 2 * inside.size
+        return np.interp(np.arange(parts[-1] + 1.0), parts, inside) if few else np.empty(0)
 
-def _dense(t: FloatArray, t0: float, t1: float) -> FloatArray:
-    slack = 1e-6 * (t1 - t0) / t.size
-    inside = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
-    intervals = np.diff(inside)
-    if inside.size < LEAST_POINTS or not np.all(intervals > 0.0):
-        return np.empty(0)
-    parts = np.ceil(intervals / (LONGEST * np.median(intervals))).astype(int)
-    if parts.sum() > 2 * inside.size:
-        return np.empty(0)
-    if parts.sum() == parts.size:
-        return inside
-    before = np.repeat(np.concatenate([[0], np.cumsum(parts)[:-1]]), parts)
-    share = (np.arange(before.size) - before) / np.repeat(parts, parts)
-    return np.append(np.repeat(inside[:-1], parts) + share * np.repeat(intervals, parts), t1)
+    return wave.remember(("points", t0, t1), dense, 1)
 
 
 def spacing_of(wave: Samples | PWL) -> float:
