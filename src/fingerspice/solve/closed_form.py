@@ -248,14 +248,29 @@ def lead_to_fold(problem: Problem, run: Run) -> Run | None:
     done = run.t.size - int(stopped)
     later = t_out[done:]
     t = np.append(later[later < path.t], path.t)
-    rows, u_gap, run.state = path.outputs(problem, t)
-    shown = np.array([as_shown(problem.scene, row) if run.by_layer else row for row in rows])
+    low, high = np.zeros(t.size), np.full(t.size, path.solution.t_max)
+    # Time rises monotonically in s, but dt/ds tends to 0 at the fold: bisection is safe there, Newton is not.
+    for _ in range(64):
+        middle = 0.5 * (low + high)
+        early = path.solution(middle)[-2] * path.scale[-2] < t - path.begin
+        low, high = np.where(early, middle, low), np.where(early, high, middle)
+    model, rows, z = model_of(problem.scene), list[FloatArray](), path.solution(high).T * path.scale
+    for here, time in zip(z, t.tolist(), strict=True):
+        s, ds = values_at(path.sources, time)
+        u, du, y, u_gap, dy = s[0], ds[0], here[:-2].copy(), here[-1], np.empty(here.size - 2)
+        run.state = from_loop(problem.scene, time, y, u, u_gap)
+        margin, speed = voltage_by_time(model, u, du, y, math.copysign(1.0, u_gap), u_gap, dy)
+        q, dq = on_branch(model.mobile, model.curve, math.copysign(1.0, u_gap), u_gap)
+        # i = Q' with Q = A U / S + z, and u' from the area equation.
+        current = dy[-1] + (du / q - dq * speed / margin * u / (q * q)) / model.s
+        row = np.append(run.state.y, current)
+        rows.append(as_shown(problem.scene, row) if run.by_layer else row)
     run.t, run.left = np.append(run.t[:done], t), np.append(problem.left[: done + t.size - 1], True)
-    run.rows = np.vstack([run.rows[:done], shown[:, : run.rows.shape[1]]])
-    run.t_failed, run.margin = path.t, 0.0
+    run.rows = np.vstack([run.rows[:done], np.array(rows)[:, : run.rows.shape[1]]])
+    run.t_failed, run.margin, u_gaps = path.t, 0.0, z[:, -1]
     for _, contact in run.record(problem).fingers:
-        force = contact.stress(u_gap) / inverse_areas(u_gap, model_of(problem.scene).curve)
-        run.gaps[0, :2] = np.maximum(run.gaps[0, :2], (np.abs(u_gap).max(), force.max()))
+        force = contact.stress(u_gaps) / inverse_areas(u_gaps, model.curve)
+        run.gaps[0, :2] = np.maximum(run.gaps[0, :2], (np.abs(u_gaps).max(), force.max()))
     return run
 
 
@@ -278,26 +293,6 @@ class _Path(NamedTuple):
     sources: Sources
     scale: FloatArray
     solution: Any  # An `OdeSolution` of scipy
-
-    def outputs(self, problem: Problem, t: FloatArray) -> tuple[list[FloatArray], FloatArray, State]:
-        """Rows as in `Record`, gap voltages along the loop (V) and the last state, at times t (s) on the path."""
-        low, high = np.zeros(t.size), np.full(t.size, self.solution.t_max)
-        # Time rises monotonically in s, but dt/ds tends to 0 at the fold: bisection is safe there, Newton is not.
-        for _ in range(64):
-            middle = 0.5 * (low + high)
-            early = self.solution(middle)[-2] * self.scale[-2] < t - self.begin
-            low, high = np.where(early, middle, low), np.where(early, high, middle)
-        model, rows, z = model_of(problem.scene), list[FloatArray](), self.solution(high).T * self.scale
-        for here, time in zip(z, t.tolist(), strict=True):
-            s, ds = values_at(self.sources, time)
-            u, du, y, u_gap, dy = s[0], ds[0], here[:-2].copy(), here[-1], np.empty(here.size - 2)
-            state = from_loop(problem.scene, time, y, u, u_gap)
-            margin, speed = voltage_by_time(model, u, du, y, math.copysign(1.0, u_gap), u_gap, dy)
-            q, dq = on_branch(model.mobile, model.curve, math.copysign(1.0, u_gap), u_gap)
-            # i = Q' with Q = A U / S + z, and u' from the area equation.
-            current = dy[-1] + (du / q - dq * speed / margin * u / (q * q)) / model.s
-            rows.append(np.append(state.y, current))
-        return rows, z[:, -1], state
 
 
 def _ahead(problem: Problem, run: Run, rtol: float) -> tuple[bool, _Path | None]:

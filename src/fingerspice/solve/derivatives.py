@@ -271,7 +271,8 @@ class _Intervals:
         by_u = by_u + by["f_el"] * contact.stress(1.0) * u * (2.0 - u * dq / q) / q
         of_modes, of_source = np.zeros((m, self.t.size)), np.zeros(self.t.size)
         place = np.searchsorted(self.t, run.t - self.slack)
-        for some in _parts_of(np.flatnonzero(by_u)):
+        counting = np.flatnonzero(by_u)
+        for some in np.split(counting, range(_AT_ONCE, counting.size, _AT_ONCE)):
             at = place[some]
             of_gap = by_u[some] * self._slopes(at, self.x[at], np.zeros(1), 1)[m + GAP]
             np.add.at(of_modes.T, at, of_gap[:m].T)
@@ -299,7 +300,7 @@ class _Intervals:
         means[SQUARES], means[AREAS] = by["f_el_mean"] * contact.stress(1.0), by["area_mean"]
         means *= (t[:-1] >= self.run.first - 1e-9 * (t[-1] - t[0])) / (t[-1] - self.run.first)
         rows = np.append(np.ones(m, bool), means.any(axis=1))
-        for at in reversed(_parts_of(np.arange(n))):
+        for at in reversed(np.split(np.arange(n), range(_AT_ONCE, n, _AT_ONCE))):
             a, b = at[0], at[-1] + 1
             own = np.ascontiguousarray(means[:, a:b]), np.ascontiguousarray(of_modes[:, a:b])
             for row, found in enumerate(self.slopes(at, rows)):
@@ -325,11 +326,6 @@ def _problem(run: Solution, sources: dict[str, Waveform]) -> Problem:
     circuit = run.circuit.varied(sources) if sources else run.circuit
     how: dict[str, Any] = {"t_stop": run.t_stop, "charge_law": run.charge_law, "area": run.area_mode}
     return asked(circuit, start=run.start, charge=False, rtol=run.rtol, **how)
-
-
-def _parts_of(numbers: IntArray) -> list[IntArray]:
-    """Rows of numbers, as many at once as memory is kept for."""
-    return [numbers[a : a + _AT_ONCE] for a in range(0, numbers.size, _AT_ONCE)]
 
 
 def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradient:

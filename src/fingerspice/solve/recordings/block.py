@@ -242,7 +242,7 @@ class Block:
         inverse = form.inverse_area(between)
         if form.mobile:
             u = inverse.max(axis=0) / c.q0 / self.margin
-            of_inverse = np.abs(form.slope(between)) * u
+            of_inverse = np.abs(form.polynomial(c.slope, between)) * u
             moved = (float(np.abs(self.x).max()) * of_inverse / inverse**2).max(axis=0)
             of_inverse, rises, rises_at_first = of_inverse.max(axis=0), rises * u, rises_at_first * u
         else:

@@ -165,22 +165,19 @@ class LaneForm(ABC):
         """Weights of steps of the lengths h (s), shape (n,), into `out` (rows, n)."""
         of_lanes.weigh(self.lanes, self.active, self.inner, h, out)
 
-    def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
+    def polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
+        """One of `lanes` at xi (V)."""
         c, flat, out = self.lanes, np.ravel(xi), np.empty(np.size(xi))
         polynomial_of(powers, c.scale, c.shift, flat, out)
         return out.reshape(np.shape(xi))
 
     def inverse_area(self, xi: FloatArray) -> FloatArray:
         """1/A, 1/m^2."""
-        return np.asarray(self.lanes.q0 + self._polynomial(self.lanes.area, xi))
-
-    def slope(self, xi: FloatArray) -> FloatArray:
-        """Derivative of 1/A by |xi|, 1/m^2/V."""
-        return self._polynomial(self.lanes.slope, xi)
+        return np.asarray(self.lanes.q0 + self.polynomial(self.lanes.area, xi))
 
     def bend(self, xi: FloatArray) -> FloatArray:
         """N, V m^2."""
-        found = self._polynomial(self.lanes.bend, xi)
+        found = self.polynomial(self.lanes.bend, xi)
         return np.negative(found, out=found, where=xi < 0.0)
 
     def gap(self, xi: FloatArray) -> FloatArray:
