@@ -107,9 +107,7 @@ class Block:
         self.kept = _scratch("kept", self.m + int(form.mobile), PIECES, self.count + 1)
         self.left = np.zeros(self.m)
         # Durations of the pieces, s.
-        self.lengths = np.full(PIECES, self.count * self.h[0])
-        if self.own:
-            self.lengths = self.h.reshape(PIECES, self.count).sum(axis=1)
+        self.lengths = self.h.reshape(PIECES, -1).sum(axis=1) if self.own else np.full(PIECES, self.count * self.h[0])
         self.decay = np.exp(-self.rates[:, None] * self.lengths)  # (m, pieces): Left of modes after each piece
 
     def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
@@ -161,9 +159,9 @@ class Block:
             starts[:active] += change
         else:
             return False
-        for k in range(active, self.m):
-            # Passive modes have begun at 0 in every piece.
-            self.kept[k] += np.cumsum(np.append(start[k], self.kept[k, :-1, -1]))[:, None]
+        # Passive modes have begun at 0 in every piece.
+        passive = self.kept[active : self.m]
+        passive += np.cumsum(np.column_stack([start[active : self.m], passive[:, :-1, -1]]), axis=1)[..., None]
         self.xi = _scratch("xi", self.x.size)
         show(form.xi[None], self.x, self.first, self.count, 0, self.n + 1, self.kept, self.xi[None])
         self.xi[self.n + 1 :] = self.xi[self.n]
@@ -347,12 +345,9 @@ class Piece:
 
     def values(self, wave: Samples | PWL) -> FloatArray:
         """The source at the limits of the steps, V."""
-        if self.times is not None:
-            return wave.value(self.times)
-        assert isinstance(wave, Samples)
-        if self.first == self.last:
-            return wave.value([self.start, self.start + self.spacing])
-        return wave.between(self.first, self.last + 1)
+        if isinstance(wave, Samples) and self.first < self.last:
+            return wave.between(self.first, self.last + 1)
+        return wave.value([self.start, self.start + self.spacing] if self.times is None else self.times)
 
 
 def driving(problem: Problem) -> tuple[int, Samples | PWL | None]:

@@ -214,8 +214,8 @@ class LaneForm(ABC):
         return np.asarray(rows.columns @ z[: self.lanes.rates.size] + rows.bends * bend + rows.k * source)
 
     def after(self, z: FloatArray, to: float) -> float:
-        """Gap voltage (V) after a jump of the source to `to`; NaN where it meets a fold."""
-        return float(self.gap(np.array(self.xi_at(z, to))))
+        """xi (V) after a jump of the source to `to`; under `mobile` NaN where it meets a fold."""
+        return self.xi_at(z, to)
 
 
 def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
@@ -422,15 +422,12 @@ class Reduced:
 
 
 def is_followed(scene: Scene, circuit: Circuit) -> bool:
-    """Whether a scene is a network with one area that moves, at once and under the local law, of cells in series."""
+    """Whether a network's scene has one area that moves, at once and under the local law, of cells in series."""
     net = scene.net
     moving = np.flatnonzero(net.gap >= 0)
-    if scene.network.stack is not None or net.mobile or moving.size != 1 or net.slow[moving[0]] >= 0:
+    if net.mobile or moving.size != 1 or net.slow[moving[0]] >= 0 or net.g_area[net.gap[moving[0]]] > 0.0:
         return False
-    cells = [cell for cell in scene.network.cells if cell.area == moving[0]]
-    if net.g_area[net.gap[moving[0]]] > 0.0:
-        return False
-    own = {cell.element.name: cell.element.nodes[:2] for cell in cells}
+    own = {cell.element.name: cell.element.nodes[:2] for cell in scene.network.cells if cell.area == moving[0]}
     ends = Counter(node for nodes in own.values() for node in nodes)
     every = Counter(node for e in circuit.elements for node in e.nodes[:2])
     # A path of k elements has k - 1 nodes inside, which nothing else touches, and two ends.
