@@ -102,7 +102,7 @@ class _Parameter:
         """The runs of `circuits`, whose errors are small enough, and whose outputs are at one time."""
         found = [run(circuit, max(_SHARE * solution.rtol, _FINEST)) for circuit in self.circuits(share)]
         for other in found:
-            largest = float(np.abs(_gaps(other)).max())
+            largest = float(np.abs(np.asarray(other.u_gap)).max())
             known = other.status is Status.ERROR_NOT_MET and other.error.u_gap <= _KNOWN * solution.rtol * largest
             if other.failure is not None and not known:
                 raise SolveError(other.failure, solution)
@@ -110,12 +110,6 @@ class _Parameter:
                 said = f"sensitivities names {self.path}, which moves the times at which the run has outputs"
                 raise InputError(f"{said}; allowed: other parameters, or given t_eval")
         return found
-
-
-def _gaps(run: Solution) -> FloatArray:
-    """Gap voltages, V, shape (n_t, n_gap)."""
-    assert run.u_gap is not None
-    return run.u_gap.reshape(run.t.size, -1)
 
 
 def check_request(problem: Problem, paths: Sequence[str], method: str) -> str:
@@ -148,7 +142,7 @@ def sensitivities_of(
         by: dict[str, Any] = {name: one.by([getattr(other, name) for other in runs]) for name in (*DERIVED, *MEANS)}
         for share in _CLOSER:
             # The area has a kink where the gap voltage is 0.
-            signs = np.sign([_gaps(other) for other in runs])
+            signs = np.sign([np.reshape(np.asarray(other.u_gap), (other.t.size, -1)) for other in runs])
             turned = np.any(signs != signs[0], axis=(0, 2))
             if not turned.any():
                 break

@@ -268,10 +268,25 @@ class Block:
         return np.array([*errors, found[:nodes].max(initial=0.0), found[nodes:].max(initial=0.0)])
 
     def _check(self, parts: int) -> _Window:
-        """Follow a window of every piece by twice as many steps."""
-        width, lanes = self.width, np.arange(PIECES)
+        """Follow windows of every piece by twice as many steps: at large moves of the source, under N at large |xi|."""
+        most, width, lanes = self.moves.T, self.width, np.arange(PIECES)
+        # Windows end before the last sample.
+        most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
+        # Where windows begin in each piece, -1 for none.
+        place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
+        # Windows of a piece, each by how much the source moves in it: the errors of kinks grow with its square.
+        squares = (np.maximum(most, 0.0) / np.maximum(most.max(axis=1, keepdims=True), 1e-300)) ** 2
+        self.busy = np.maximum(self.count / (width * most.shape[1]) * np.stack([squares, squares**2]).sum(axis=-1), 1.0)
+        if self.starts_run:
+            place[0] = 0
+        places = [place]
+        if self.form.bent:
+            ends = np.minimum(self.count, self.n - self.first) - width
+            largest = np.argmax(np.abs(self.xi[:-1]).reshape(PIECES, self.count), axis=1)
+            largest = np.minimum(largest - width // 2, ends)
+            places.append(np.where(place >= 0, np.maximum(largest, 0), -1))
         off, z, at, inside = np.empty(0), np.empty(0), lanes, np.arange(width + 1)
-        for number, place in enumerate(self._windows()):
+        for number, place in enumerate(places):
             first = np.maximum(place, 0)
             coarse = self.kept[:, lanes[:, None], first[:, None] + inside]
             fine = np.empty(coarse.shape)
@@ -288,24 +303,6 @@ class Block:
         inside = (at + self.first)[:, None] + inside
         took = self.h[inside[:, :-1]].sum(axis=1) if self.own else np.full(PIECES, width * self.h[0])
         return _Window(z, off, self.x[inside], self.xi[inside], took)
-
-    def _windows(self) -> list[IntArray]:
-        """Where windows begin in each piece, -1 for none: at large moves of the source, under N at large |xi|, too."""
-        most, width = self.moves.T, self.width
-        # Windows end before the last sample.
-        most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
-        place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
-        # Windows of a piece, each by how much the source moves in it: the errors of kinks grow with its square.
-        squares = (np.maximum(most, 0.0) / np.maximum(most.max(axis=1, keepdims=True), 1e-300)) ** 2
-        self.busy = np.maximum(self.count / (width * most.shape[1]) * np.stack([squares, squares**2]).sum(axis=-1), 1.0)
-        if self.starts_run:
-            place[0] = 0
-        if not self.form.bent:
-            return [place]
-        ends = np.minimum(self.count, self.n - self.first) - width
-        largest = np.argmax(np.abs(self.xi[:-1]).reshape(PIECES, self.count), axis=1)
-        largest = np.minimum(largest - width // 2, ends)
-        return [place, np.where(place >= 0, np.maximum(largest, 0), -1)]
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
         """Source (V; n,) and states (rows, n) `since` (s) after samples with these numbers, in `parts` steps."""
