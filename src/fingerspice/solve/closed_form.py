@@ -25,6 +25,7 @@ from fingerspice.engine.one_area.model import dot, jump_charges, ramp, source_at
 from fingerspice.numerics import linear
 from fingerspice.physics.contact import inverse_areas, inverse_areas_with_slopes
 from fingerspice.results.outcome import State, Status
+from fingerspice.solve.collocation import by_modes
 from fingerspice.solve.collocation import solve as solve_by_steps
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, values_at
 from fingerspice.solve.runs import PAST_FOLD, Run, closed_form, gap_signals
@@ -153,21 +154,15 @@ def _charge(
     problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, t: FloatArray, answer: _Answer
 ) -> list[FloatArray]:
     """Charge (C) and regular current (A) that each source has delivered at times t, both (n_t, n_s)."""
-    net, start = problem.network, problem.initial
-    n, x, s = modes.rates.size, answer.x(modes), answer.s
-    capacitance, leak = net.capacitance(area)[:, None], net.leak(area)[:, None]
-    stored_x, stored_s = net.through @ (capacitance * net.p), net.through @ (capacitance * net.q)
-    lost_x = net.through @ (leak * net.p) + net.delivered[:, :n]
-    lost_s = net.through @ (leak * net.q) + net.delivered[:, n:]
+    start, by, v, s = problem.initial, by_modes(problem.network, modes, area), answer.v, answer.s
     draining = modes.rates > 0.0
-    passed, held = _along(modes.gains, answer.integral) - (answer.v - v0), np.outer(t - problem.t_start, v0)
+    passed, held = _along(modes.gains, answer.integral) - (v - v0), np.outer(t - problem.t_start, v0)
     # A mode with rate 0 has no leakage current, so that any value of its integral will do.
     integral = np.where(draining, passed / np.where(draining, modes.rates, 1.0), held)
-    x_integral = answer._replace(v=integral, s=answer.integral).x(modes)
-    dx = answer._replace(v=_along(modes.gains, s) - modes.rates * answer.v, s=answer.slope).x(modes)
-    moved = _along(stored_x, x - start.y[:n]) + _along(stored_s, s - start.s_before)
-    charge = start.y[n:] + moved + _along(lost_x, x_integral) + _along(lost_s, answer.integral)
-    current = _along(stored_x, dx) + _along(stored_s, answer.slope) + _along(lost_x, x) + _along(lost_s, s)
+    moved = _along(by["stored"], v - v0) + _along(by["stored_s"], s - start.s_before)
+    charge = start.y[v0.size :] + moved + _along(by["lost"], integral) + _along(by["lost_s"], answer.integral)
+    moving = _along(by["stored"], _along(modes.gains, s) - modes.rates * v) + _along(by["stored_s"], answer.slope)
+    current = moving + _along(by["lost"], v) + _along(by["lost_s"], s)
     return [charge, current]
 
 
