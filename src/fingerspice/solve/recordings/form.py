@@ -51,9 +51,9 @@ from fingerspice.waveforms.samples import Samples
 
 # Number of lanes, each with a piece of a recording.
 PIECES = 64
-# Numbers of active modes that code is compiled for, as a new one takes 15 to 30 s: others get modes that stay at 0; and
-# fewest leaks, of which the rest stays at 0, too.
-SIZES, LEAST_LEAKS = (2, 4, 7, 10, 14, 20, 28, 40, 56), 2
+# Numbers of active modes that code is compiled for, as a new one takes 15 to 30 s: others get modes that stay at 0; the
+# fewest in a network; and fewest leaks, of which the rest stays at 0, too.
+SIZES, LEAST_MODES, LEAST_LEAKS = (2, 4, 7, 10, 14, 20, 28, 40, 56), 4, 2
 # Relative error from which on steps in a stack have Simpson's nodes, and need two evaluations in the place of three.
 BY_SIMPSON = 1e-5
 # Largest degree of the polynomial for 1/A.
@@ -70,8 +70,6 @@ _FREQUENCIES = 65
 # Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
 # what they leave together is known but for about 1e-8.
 OF_MANY, ACTING = 1e-7, 0.05
-# Fewest active modes that code is compiled for.
-LEAST_MODES = 4
 # Reference area: that at this share of the largest gap voltage to expect.
 _TYPICAL = 0.5
 
@@ -214,7 +212,7 @@ class LaneForm(ABC):
         return np.asarray(rows.columns @ z[: self.lanes.rates.size] + rows.bends * bend + rows.k * source)
 
     def after(self, z: FloatArray, to: float) -> float:
-        """xi (V) after a jump of the source to `to`; under `mobile` NaN where it meets a fold."""
+        """xi (V) after a jump of the source to `to`; of a stack under `mobile`, NaN where it meets a fold."""
         return self.xi_at(z, to)
 
 
@@ -281,8 +279,6 @@ class StackForm(LaneForm):
         return np.append(z, u_gap) if self.mobile else z, before
 
     def after(self, z: FloatArray, to: float) -> float:
-        if not self.mobile:
-            return super().after(z, to)
         model = self.system.model
         return float(ramp(model, model.k_gap * to, dot(self.system.gap[0], z), float(z[-1])))
 

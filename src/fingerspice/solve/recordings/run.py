@@ -1,9 +1,7 @@
 """Recordings of one finger, block by block in lanes (`solve.recordings.block`), with stated errors.
 
-Runs under a recorded source, sample by sample, in pieces of fixed length.
-
-The error of each piece is judged at its end, independently of later pieces. Its outputs are therefore the same however
-long the run is, and whether all outputs are held in one array or streamed in chunks.
+A run is followed in pieces of fixed length. The error of each is judged at its end, independently of later pieces. Its
+outputs are therefore the same however long the run is, and whether all are held in one array or streamed in chunks.
 """
 
 from __future__ import annotations
