@@ -60,13 +60,10 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     else:
         answer, last, end = _answer(problem, tables, None if at_once else modes, v0)
         rows = answer.x(modes)
-        if problem.charge and at_once:
-            z, current, charge_error = _loop_charge(problem, answer)
-            rows, z_end = np.hstack([rows, z, current]), _loop_charge(problem, last)[0][0]
-        elif problem.charge:
-            flow = partial(_charge, problem, area, modes, v0)
-            rows = np.hstack([rows, *flow(problem.t_out[: len(rows)], answer)])
-            z_end = flow(np.array([end]), last)[0][0]
+        if problem.charge:
+            flow = partial(_loop_charge, problem) if at_once else partial(_charge, problem, area, modes, v0)
+            (z, current, charge_error), (z_last, _, _) = flow(answer), flow(last)
+            rows, z_end = np.hstack([rows, z, current]), z_last[0]
     y = np.concatenate([last.x(modes)[0], z_end])
     state = State(end, y, last.s[0], np.zeros(area.size), scene.charge_law)
     status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
@@ -151,19 +148,17 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
 
 
 def _charge(
-    problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, t: FloatArray, answer: _Answer
-) -> list[FloatArray]:
-    """Charge (C) and regular current (A) that each source has delivered at times t, both (n_t, n_s)."""
+    problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, answer: _Answer
+) -> tuple[FloatArray, FloatArray, float | None]:
+    """Charge (C) and regular current (A) that each source has delivered, both (n_t, n_s), with no error known."""
     start, by, v, s = problem.initial, by_modes(problem.network, modes, area), answer.v, answer.s
-    draining = modes.rates > 0.0
-    passed, held = _along(modes.gains, answer.integral) - (v - v0), np.outer(t - problem.t_start, v0)
     # A mode with rate 0 has no leakage current, so that any value of its integral will do.
-    integral = np.where(draining, passed / np.where(draining, modes.rates, 1.0), held)
+    integral = (_along(modes.gains, answer.integral) - (v - v0)) / np.where(modes.rates > 0.0, modes.rates, np.inf)
     moved = _along(by["stored"], v - v0) + _along(by["stored_s"], s - start.s_before)
     charge = start.y[v0.size :] + moved + _along(by["lost"], integral) + _along(by["lost_s"], answer.integral)
     moving = _along(by["stored"], _along(modes.gains, s) - modes.rates * v) + _along(by["stored_s"], answer.slope)
     current = moving + _along(by["lost"], v) + _along(by["lost_s"], s)
-    return [charge, current]
+    return charge, current, None
 
 
 def _state_errors(problem: Problem, run: Run, bound: float) -> None:
@@ -188,7 +183,7 @@ def _state_errors(problem: Problem, run: Run, bound: float) -> None:
     run.gaps, run.node_error = np.array(gaps), rounding + bound * largest
 
 
-def _loop_charge(problem: Problem, answer: _Answer) -> tuple[FloatArray, FloatArray, float]:
+def _loop_charge(problem: Problem, answer: _Answer) -> tuple[FloatArray, FloatArray, float | None]:
     """Charge (C) and current (A) of a stack without leaks, both (n_t, 1), and the error of the charge, C."""
     model, (y, _), moved = model_of(problem.scene), problem.inner, np.empty(len(answer.s))
     u, slope, x_gap, error = answer.s[:, 0].copy(), answer.slope[:, 0], float(dot(model.gap, y)), 0.0
