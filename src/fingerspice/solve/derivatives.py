@@ -66,21 +66,18 @@ class _Parameter:
         self.path = known[path.lower()]
         parameter = self.circuit.parameters[self.path]
         self.value, self.unit, self.step = parameter.value, parameter.unit, _STEP
-        if not (math.isfinite(self.value) and self.value != 0.0):
-            raise self.not_by(f"is {self.value:g}", "whose value is finite and not 0, as steps are relative to it")
+        said = f"sensitivities names {self.path}, which is {self.value:g}; allowed: parameters whose value is finite"
+        refuse(not (math.isfinite(self.value) and self.value != 0.0), f"{said} and not 0, as steps are relative to it")
         element, span = self.path.rpartition(".")[0], (problem.t_start, problem.t_stop)
         own = self.circuit[element].waveform
         if own is None:
             return
         # A phase is a frequency times all the time since the start.
         self.step /= max(1.0, 2.0 * math.pi * problem.t_stop / own.shortest_time())
+        said = f"sensitivities names {self.path}, which moves the edges of its source; allowed: parameters that leave"
+        said = f"{said} them where they are, such as an amplitude, or the frequency of a sine"
         for wave in (circuit[element].waveform for circuit in self.circuits()):
-            if wave is None or not np.array_equal(wave.breakpoints(*span), own.breakpoints(*span)):
-                allowed = "that leave them where they are, such as an amplitude, or the frequency of a sine"
-                raise self.not_by("moves the edges of its source", allowed)
-
-    def not_by(self, which: str, allowed: str) -> InputError:
-        return InputError(f"sensitivities names {self.path}, which {which}; allowed: parameters {allowed}")
+            refuse(wave is None or not np.array_equal(wave.breakpoints(*span), own.breakpoints(*span)), said)
 
     def circuits(self, share: float = 1.0) -> list[Circuit]:
         """Circuits around its value, with a `share` of the step."""
@@ -106,24 +103,22 @@ class _Parameter:
             known = other.status is Status.ERROR_NOT_MET and other.error.u_gap <= _KNOWN * solution.rtol * largest
             if other.failure is not None and not known:
                 raise SolveError(other.failure, solution)
-            if not np.array_equal(other.t, solution.t):
-                said = f"sensitivities names {self.path}, which moves the times at which the run has outputs"
-                raise InputError(f"{said}; allowed: other parameters, or given t_eval")
+            said = f"sensitivities names {self.path}, which moves the times at which the run has outputs"
+            refuse(not np.array_equal(other.t, solution.t), f"{said}; allowed: other parameters, or given t_eval")
         return found
 
 
 def check_request(problem: Problem, paths: Sequence[str], method: str) -> str:
     """Refuse a run that has no sensitivities; the method of the runs that are compared."""
-    if isinstance(paths, str) or not all(isinstance(path, str) for path in paths):
-        raise InputError(f"sensitivities is {paths!r}; allowed: a sequence of paths such as ('Xgap.d',)")
+    wrong = isinstance(paths, str) or not all(isinstance(path, str) for path in paths)
+    refuse(wrong, f"sensitivities is {paths!r}; allowed: a sequence of paths such as ('Xgap.d',)")
+    allowed = "a circuit with a GAP, one of the other starts, and the methods 'auto' and 'exponential'"
     for what, refused in (
         ("the circuit has no GAP", not problem.network.fingers),
         ("the run goes on from another one", problem.start == "given"),
         (f"the method is {method!r}", method not in ("auto", "exponential")),
     ):
-        if refused:
-            allowed = "a circuit with a GAP, one of the other starts, and the methods 'auto' and 'exponential'"
-            raise InputError(f"sensitivities are asked for, and {what}; allowed: {allowed}")
+        refuse(refused, f"sensitivities are asked for, and {what}; allowed: {allowed}")
     # A recording, or a PWL with many points, is otherwise followed point by point, to no error as small as needed here.
     return method if driving(problem)[1] is None else "exponential"
 
@@ -135,9 +130,8 @@ def sensitivities_of(
     found = {}
     for one in [_Parameter(problem, path) for path in paths]:
         longer = one.longer() if problem.begun is not None else 0.0
-        if math.isnan(longer):
-            said = f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period"
-            raise InputError(f"{said}; allowed: other parameters, or a run from another start")
+        said = f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period"
+        refuse(math.isnan(longer), f"{said}; allowed: other parameters, or a run from another start")
         runs = one.runs(1.0, run, solution)
         by: dict[str, Any] = {name: one.by([getattr(other, name) for other in runs]) for name in (*DERIVED, *MEANS)}
         for share in _CLOSER:
@@ -324,9 +318,8 @@ def _problem(run: Solution, sources: dict[str, Waveform]) -> Problem:
 
 def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradient:
     """See `Solution.sample_gradient`."""
-    if run.stored is not None or run.start == "given":
-        allowed = "a run just made from its circuit's own start"
-        raise InputError(f"{_ASKED}the run goes on from another one or was read from a file; allowed: {allowed}")
+    said = f"{_ASKED}the run goes on from another one or was read from a file; allowed: a run just made"
+    refuse(run.stored is not None or run.start == "given", f"{said} from its circuit's own start")
     refuse(run.failure is not None, f"{_ASKED}the run failed; allowed: a run to its end")
     one = _Intervals(run, of)
     coarse, fine = one.swept()
