@@ -221,7 +221,7 @@ def _identity(run: Stream, circuit: fs.Circuit, how: dict[str, Any], names: list
     return {
         "circuit": elements, "source": sources, "rtol": how["rtol"], "charge_law": scene.charge_law,
         "area": scene.area_mode, "method": how["method"], "start": str(how["start"]), "chunk": run.count,
-        "signals": names, "end": run.problem.t_stop, "output_times": [o.start, o.over, o.low, o.total],
+        "signals": names, "end": run.problem.t_stop, "output_times": [o.start, o.rate or o.spacing, o.low, o.total],
         "program": f"fingerspice {fs.__version__} ({STAMP[:12]}), NumPy {np.__version__}",
     }  # fmt: skip
 

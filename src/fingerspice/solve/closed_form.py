@@ -11,7 +11,6 @@ m = 0, or comes to rest there.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -26,6 +25,7 @@ from fingerspice.engine.one_area.model import dot, jump_charges, ramp, source_at
 from fingerspice.numerics import linear
 from fingerspice.physics.contact import inverse_areas, inverse_areas_with_slopes
 from fingerspice.results.outcome import State, Status
+from fingerspice.solve.collocation import by_modes
 from fingerspice.solve.collocation import solve as solve_by_steps
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, values_at
 from fingerspice.solve.runs import PAST_FOLD, Run, closed_form, gap_signals
@@ -60,17 +60,21 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     else:
         answer, last, end = _answer(problem, tables, None if at_once else modes, v0)
         rows = answer.x(modes)
-        if problem.charge and at_once:
-            z, current, charge_error = _loop_charge(problem, answer)
-            rows, z_end = np.hstack([rows, z, current]), _loop_charge(problem, last)[0][0]
-        elif problem.charge:
-            flow = partial(_charge, problem, area, modes, v0)
-            rows = np.hstack([rows, *flow(problem.t_out[: len(rows)], answer)])
-            z_end = flow(np.array([end]), last)[0][0]
+        if problem.charge:
+            flow = partial(_loop_charge, problem) if at_once else partial(_charge, problem, area, modes, v0)
+            (z, current, charge_error), (z_last, _, _) = flow(answer), flow(last)
+            rows, z_end = np.hstack([rows, z, current]), z_last[0]
     y = np.concatenate([last.x(modes)[0], z_end])
     state = State(end, y, last.s[0], np.zeros(area.size), scene.charge_law)
-    run = _finished(problem, tables, rows, state, bound, partial(solve_linear, area=None if at_once else area))
+    status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
+    run = Run(problem.t_out[: len(rows)], problem.left[: len(rows)], rows, status, 0, {}, state)
+    run.t_failed, run.unseen, run.rough = tables.not_finite, tables.unseen, tables.rough
     run.charge_error = charge_error
+    _state_errors(problem, run, bound)
+    if not scene.is_sampled:
+        # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
+        again = partial(solve_linear, area=None if at_once else area)
+        run.continuous = closed_form(replace(problem, charge=False), again)
     return run
 
 
@@ -133,9 +137,8 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
     wave, t_out = problem.network.waveform, problem.t_out
     if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
         return None
-    if wave.start != problem.t_start or t_out[-1] < problem.t_stop * (1.0 - 1e-12):
-        return None
-    if not on_grid(t_out, wave.start, 1.0 / wave.rate, same_time(problem.t_stop)):
+    whole = wave.start == problem.t_start and t_out[-1] >= problem.t_stop * (1.0 - 1e-12)
+    if not (whole and on_grid(t_out, wave.start, 1.0 / wave.rate, same_time(problem.t_stop))):
         return None
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
     u, rates, gains = wave.values[:count], modes.rates, np.ascontiguousarray(modes.gains[:, 0])
@@ -145,38 +148,24 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
 
 
 def _charge(
-    problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, t: FloatArray, answer: _Answer
-) -> list[FloatArray]:
-    """Charge (C) and regular current (A) that each source has delivered at times t, both (n_t, n_s)."""
-    net, start = problem.network, problem.initial
-    n, x, s = modes.rates.size, answer.x(modes), answer.s
-    capacitance, leak = net.capacitance(area)[:, None], net.leak(area)[:, None]
-    stored_x, stored_s = net.through @ (capacitance * net.p), net.through @ (capacitance * net.q)
-    lost_x = net.through @ (leak * net.p) + net.delivered[:, :n]
-    lost_s = net.through @ (leak * net.q) + net.delivered[:, n:]
-    draining = modes.rates > 0.0
-    passed, held = _along(modes.gains, answer.integral) - (answer.v - v0), np.outer(t - problem.t_start, v0)
+    problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, answer: _Answer
+) -> tuple[FloatArray, FloatArray, float | None]:
+    """Charge (C) and regular current (A) that each source has delivered, both (n_t, n_s), with no error known."""
+    start, by, v, s = problem.initial, by_modes(problem.network, modes, area), answer.v, answer.s
     # A mode with rate 0 has no leakage current, so that any value of its integral will do.
-    integral = np.where(draining, passed / np.where(draining, modes.rates, 1.0), held)
-    x_integral = answer._replace(v=integral, s=answer.integral).x(modes)
-    dx = answer._replace(v=_along(modes.gains, s) - modes.rates * answer.v, s=answer.slope).x(modes)
-    moved = _along(stored_x, x - start.y[:n]) + _along(stored_s, s - start.s_before)
-    charge = start.y[n:] + moved + _along(lost_x, x_integral) + _along(lost_s, answer.integral)
-    current = _along(stored_x, dx) + _along(stored_s, answer.slope) + _along(lost_x, x) + _along(lost_s, s)
-    return [charge, current]
+    integral = (_along(modes.gains, answer.integral) - (v - v0)) / np.where(modes.rates > 0.0, modes.rates, np.inf)
+    moved = _along(by["stored"], v - v0) + _along(by["stored_s"], s - start.s_before)
+    charge = start.y[v0.size :] + moved + _along(by["lost"], integral) + _along(by["lost_s"], answer.integral)
+    moving = _along(by["stored"], _along(modes.gains, s) - modes.rates * v) + _along(by["stored_s"], answer.slope)
+    current = moving + _along(by["lost"], v) + _along(by["lost_s"], s)
+    return charge, current, None
 
 
-def _finished(
-    problem: Problem, tables: Tables, rows: FloatArray, state: State, bound: float, again: Callable[[Problem], Run]
-) -> Run:
-    """A run with its peaks and its stated errors: round-off, and `bound` relative to the peaks."""
-    status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
-    t, left = problem.t_out[: len(rows)], problem.left[: len(rows)]
-    run = Run(t, left, rows, status, 0, {}, state, t_failed=tables.not_finite)
-    run.unseen, run.rough = tables.unseen, tables.rough
+def _state_errors(problem: Problem, run: Run, bound: float) -> None:
+    """Peaks and stated errors of a run: round-off, and `bound` relative to the peaks."""
     largest = max(problem.largest, problem.scene.u_size)
     if problem.network.n_voltage < len(problem.network.sources):
-        largest = max(largest, float(np.abs(rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
+        largest = max(largest, float(np.abs(run.rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
     rounding = (ROUNDING_OF_MATRICES if problem.network.stack is None else ROUNDING) * largest
     gaps, record = [], run.record(problem)
     for i, u in enumerate(record.each("u_gap")):
@@ -192,13 +181,9 @@ def _finished(
         peak = max((float(np.abs(u).max(initial=0.0)) for u, _ in gap_signals(record)), default=0.0)
         gaps = [(peak, 0.0, rounding + bound * peak, 0.0)]
     run.gaps, run.node_error = np.array(gaps), rounding + bound * largest
-    if not problem.scene.is_sampled:
-        # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
-        run.continuous = closed_form(replace(problem, charge=False), again)
-    return run
 
 
-def _loop_charge(problem: Problem, answer: _Answer) -> tuple[FloatArray, FloatArray, float]:
+def _loop_charge(problem: Problem, answer: _Answer) -> tuple[FloatArray, FloatArray, float | None]:
     """Charge (C) and current (A) of a stack without leaks, both (n_t, 1), and the error of the charge, C."""
     model, (y, _), moved = model_of(problem.scene), problem.inner, np.empty(len(answer.s))
     u, slope, x_gap, error = answer.s[:, 0].copy(), answer.slope[:, 0], float(dot(model.gap, y)), 0.0
@@ -253,14 +238,29 @@ def lead_to_fold(problem: Problem, run: Run) -> Run | None:
     done = run.t.size - int(stopped)
     later = t_out[done:]
     t = np.append(later[later < path.t], path.t)
-    rows, u_gap, run.state = path.outputs(problem, t)
-    shown = np.array([as_shown(problem.scene, row) if run.by_layer else row for row in rows])
+    low, high = np.zeros(t.size), np.full(t.size, path.solution.t_max)
+    # Time rises monotonically in s, but dt/ds tends to 0 at the fold: bisection is safe there, Newton is not.
+    for _ in range(64):
+        middle = 0.5 * (low + high)
+        early = path.solution(middle)[-2] * path.scale[-2] < t - path.begin
+        low, high = np.where(early, middle, low), np.where(early, high, middle)
+    model, rows, z = model_of(problem.scene), list[FloatArray](), path.solution(high).T * path.scale
+    for here, time in zip(z, t.tolist(), strict=True):
+        s, ds = values_at(path.sources, time)
+        u, du, y, u_gap, dy = s[0], ds[0], here[:-2].copy(), here[-1], np.empty(here.size - 2)
+        run.state = from_loop(problem.scene, time, y, u, u_gap)
+        margin, speed = voltage_by_time(model, u, du, y, math.copysign(1.0, u_gap), u_gap, dy)
+        q, dq = on_branch(model.mobile, model.curve, math.copysign(1.0, u_gap), u_gap)
+        # i = Q' with Q = A U / S + z, and u' from the area equation.
+        current = dy[-1] + (du / q - dq * speed / margin * u / (q * q)) / model.s
+        row = np.append(run.state.y, current)
+        rows.append(as_shown(problem.scene, row) if run.by_layer else row)
     run.t, run.left = np.append(run.t[:done], t), np.append(problem.left[: done + t.size - 1], True)
-    run.rows = np.vstack([run.rows[:done], shown[:, : run.rows.shape[1]]])
-    run.t_failed, run.margin = path.t, 0.0
+    run.rows = np.vstack([run.rows[:done], np.array(rows)[:, : run.rows.shape[1]]])
+    run.t_failed, run.margin, u_gaps = path.t, 0.0, z[:, -1]
     for _, contact in run.record(problem).fingers:
-        force = contact.stress(u_gap) / inverse_areas(u_gap, model_of(problem.scene).curve)
-        run.gaps[0, :2] = np.maximum(run.gaps[0, :2], (np.abs(u_gap).max(), force.max()))
+        force = contact.stress(u_gaps) / inverse_areas(u_gaps, model.curve)
+        run.gaps[0, :2] = np.maximum(run.gaps[0, :2], (np.abs(u_gaps).max(), force.max()))
     return run
 
 
@@ -279,34 +279,10 @@ class _Path(NamedTuple):
     """State (n + 1,), time since `begin` (s) and gap voltage (V) as functions of the variable s, up to the fold."""
 
     begin: float
+    t: float  # Time of the fold, s
     sources: Sources
     scale: FloatArray
     solution: Any  # An `OdeSolution` of scipy
-
-    @property
-    def t(self) -> float:
-        """Time of the fold, s."""
-        return self.begin + float(self.solution(self.solution.t_max)[-2] * self.scale[-2])
-
-    def outputs(self, problem: Problem, t: FloatArray) -> tuple[list[FloatArray], FloatArray, State]:
-        """Rows as in `Record`, gap voltages along the loop (V) and the last state, at times t (s) on the path."""
-        low, high = np.zeros(t.size), np.full(t.size, self.solution.t_max)
-        # Time rises monotonically in s, but dt/ds tends to 0 at the fold: bisection is safe there, Newton is not.
-        for _ in range(64):
-            middle = 0.5 * (low + high)
-            early = self.solution(middle)[-2] * self.scale[-2] < t - self.begin
-            low, high = np.where(early, middle, low), np.where(early, high, middle)
-        model, rows, z = model_of(problem.scene), list[FloatArray](), self.solution(high).T * self.scale
-        for here, time in zip(z, t.tolist(), strict=True):
-            s, ds = values_at(self.sources, time)
-            u, du, y, u_gap, dy = s[0], ds[0], here[:-2].copy(), here[-1], np.empty(here.size - 2)
-            state = from_loop(problem.scene, time, y, u, u_gap)
-            margin, speed = voltage_by_time(model, u, du, y, math.copysign(1.0, u_gap), u_gap, dy)
-            q, dq = on_branch(model.mobile, model.curve, math.copysign(1.0, u_gap), u_gap)
-            # i = Q' with Q = A U / S + z, and u' from the area equation.
-            current = dy[-1] + (du / q - dq * speed / margin * u / (q * q)) / model.s
-            rows.append(np.append(state.y, current))
-        return rows, z[:, -1], state
 
 
 def _ahead(problem: Problem, run: Run, rtol: float) -> tuple[bool, _Path | None]:
@@ -387,4 +363,4 @@ def _path(problem: Problem, t: float, y: FloatArray, sources: Sources, u: float,
     missed = last[n + 1] - model.k_gap * s[0] - model.area0 * q * dot(model.gap, last[:n])
     if abs(missed) > STRAYED * abs(last[n + 1]):
         raise _LostError
-    return _Path(t, sources, scale, found.sol)
+    return _Path(t, t + float(last[n]), sources, scale, found.sol)

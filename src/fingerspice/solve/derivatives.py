@@ -66,21 +66,18 @@ class _Parameter:
         self.path = known[path.lower()]
         parameter = self.circuit.parameters[self.path]
         self.value, self.unit, self.step = parameter.value, parameter.unit, _STEP
-        if not (math.isfinite(self.value) and self.value != 0.0):
-            raise self.not_by(f"is {self.value:g}", "whose value is finite and not 0, as steps are relative to it")
+        said = f"sensitivities names {self.path}, which is {self.value:g}; allowed: parameters whose value is finite"
+        refuse(not (math.isfinite(self.value) and self.value != 0.0), f"{said} and not 0, as steps are relative to it")
         element, span = self.path.rpartition(".")[0], (problem.t_start, problem.t_stop)
         own = self.circuit[element].waveform
         if own is None:
             return
         # A phase is a frequency times all the time since the start.
         self.step /= max(1.0, 2.0 * math.pi * problem.t_stop / own.shortest_time())
+        said = f"sensitivities names {self.path}, which moves the edges of its source; allowed: parameters that leave"
+        said = f"{said} them where they are, such as an amplitude, or the frequency of a sine"
         for wave in (circuit[element].waveform for circuit in self.circuits()):
-            if wave is None or not np.array_equal(wave.breakpoints(*span), own.breakpoints(*span)):
-                allowed = "that leave them where they are, such as an amplitude, or the frequency of a sine"
-                raise self.not_by("moves the edges of its source", allowed)
-
-    def not_by(self, which: str, allowed: str) -> InputError:
-        return InputError(f"sensitivities names {self.path}, which {which}; allowed: parameters {allowed}")
+            refuse(wave is None or not np.array_equal(wave.breakpoints(*span), own.breakpoints(*span)), said)
 
     def circuits(self, share: float = 1.0) -> list[Circuit]:
         """Circuits around its value, with a `share` of the step."""
@@ -102,34 +99,26 @@ class _Parameter:
         """The runs of `circuits`, whose errors are small enough, and whose outputs are at one time."""
         found = [run(circuit, max(_SHARE * solution.rtol, _FINEST)) for circuit in self.circuits(share)]
         for other in found:
-            largest = float(np.abs(_gaps(other)).max())
+            largest = float(np.abs(np.asarray(other.u_gap)).max())
             known = other.status is Status.ERROR_NOT_MET and other.error.u_gap <= _KNOWN * solution.rtol * largest
             if other.failure is not None and not known:
                 raise SolveError(other.failure, solution)
-            if not np.array_equal(other.t, solution.t):
-                said = f"sensitivities names {self.path}, which moves the times at which the run has outputs"
-                raise InputError(f"{said}; allowed: other parameters, or given t_eval")
+            said = f"sensitivities names {self.path}, which moves the times at which the run has outputs"
+            refuse(not np.array_equal(other.t, solution.t), f"{said}; allowed: other parameters, or given t_eval")
         return found
-
-
-def _gaps(run: Solution) -> FloatArray:
-    """Gap voltages, V, shape (n_t, n_gap)."""
-    assert run.u_gap is not None
-    return run.u_gap.reshape(run.t.size, -1)
 
 
 def check_request(problem: Problem, paths: Sequence[str], method: str) -> str:
     """Refuse a run that has no sensitivities; the method of the runs that are compared."""
-    if isinstance(paths, str) or not all(isinstance(path, str) for path in paths):
-        raise InputError(f"sensitivities is {paths!r}; allowed: a sequence of paths such as ('Xgap.d',)")
+    wrong = isinstance(paths, str) or not all(isinstance(path, str) for path in paths)
+    refuse(wrong, f"sensitivities is {paths!r}; allowed: a sequence of paths such as ('Xgap.d',)")
+    allowed = "a circuit with a GAP, one of the other starts, and the methods 'auto' and 'exponential'"
     for what, refused in (
         ("the circuit has no GAP", not problem.network.fingers),
         ("the run goes on from another one", problem.start == "given"),
         (f"the method is {method!r}", method not in ("auto", "exponential")),
     ):
-        if refused:
-            allowed = "a circuit with a GAP, one of the other starts, and the methods 'auto' and 'exponential'"
-            raise InputError(f"sensitivities are asked for, and {what}; allowed: {allowed}")
+        refuse(refused, f"sensitivities are asked for, and {what}; allowed: {allowed}")
     # A recording, or a PWL with many points, is otherwise followed point by point, to no error as small as needed here.
     return method if driving(problem)[1] is None else "exponential"
 
@@ -141,14 +130,13 @@ def sensitivities_of(
     found = {}
     for one in [_Parameter(problem, path) for path in paths]:
         longer = one.longer() if problem.begun is not None else 0.0
-        if math.isnan(longer):
-            said = f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period"
-            raise InputError(f"{said}; allowed: other parameters, or a run from another start")
+        said = f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period"
+        refuse(math.isnan(longer), f"{said}; allowed: other parameters, or a run from another start")
         runs = one.runs(1.0, run, solution)
         by: dict[str, Any] = {name: one.by([getattr(other, name) for other in runs]) for name in (*DERIVED, *MEANS)}
         for share in _CLOSER:
             # The area has a kink where the gap voltage is 0.
-            signs = np.sign([_gaps(other) for other in runs])
+            signs = np.sign([np.reshape(np.asarray(other.u_gap), (other.t.size, -1)) for other in runs])
             turned = np.any(signs != signs[0], axis=(0, 2))
             if not turned.any():
                 break
@@ -186,7 +174,7 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
 class _Intervals:
     """The intervals of a run between the samples of its source, its outputs, and the start of its means."""
 
-    def __init__(self, run: Solution) -> None:
+    def __init__(self, run: Solution, of: Mapping[str, ArrayLike]) -> None:
         self.run, self.problem = run, _problem(run, {})
         problem, rtol = self.problem, run.rtol
         if len(problem.network.fingers) != 1 or not problem.scene.coupled:
@@ -204,21 +192,19 @@ class _Intervals:
         if form is None:
             said = "this circuit is not followed sample by sample (docs/recordings.md)"
             raise InputError(f"{_ASKED}{said}; allowed: a circuit that is")
-        self.wave, self.form, self.m = wave, form, form.lanes.rates.size
+        self.wave, self.form, self.m, self.by = wave, form, form.lanes.rates.size, _weights(run, of)
         self.parts = _STEPS if rtol >= _COARSE else _STEPS[1:]
-
-    def _divide(self, by: Mapping[str, Any]) -> None:
-        """Make the intervals, for the outputs that count."""
-        run, wave, t0, t1 = self.run, self.wave, self.problem.t_start, self.problem.t_stop
+        t0, t1, self.slack = problem.t_start, problem.t_stop, 1e-6 / wave.rate
         first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
-        more, self.slack = np.append(run.t[np.any([by[name] for name in DERIVED], axis=0)], run.first), 1e-6 / wave.rate
+        # Only the outputs that count.
+        more = np.append(run.t[np.any([self.by[name] for name in DERIVED], axis=0)], run.first)
         more = more[np.abs((more - wave.start) * wave.rate % 1.0 - 0.5) < 0.5 - 1e-6]
         t = np.unique(np.concatenate([wave.start + np.arange(first, last + 1) / wave.rate, more]))
         t = np.concatenate([[t0], t[(t > t0 + self.slack) & (t < t1 - self.slack)], [t1]])
         # (n + 1,): Start and end of the run, and samples and outputs between, s
         self.t = t[np.append(True, np.diff(t) > self.slack)]
         # (n + 1,): The source at these times
-        self.x, h = np.ascontiguousarray(self.problem.network.waveform.value(self.t)), np.diff(self.t)
+        self.x, h = np.ascontiguousarray(problem.network.waveform.value(self.t)), np.diff(self.t)
         # Lengths of the intervals (n,), or their common one (1,), s
         self.h = h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
 
@@ -259,9 +245,9 @@ class _Intervals:
             wanted[..., still] = rows[:, None, None] & off
         return [np.where(zero, coarse, fine), fine + (fine - coarse) / 7.0]
 
-    def outputs(self, by: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+    def outputs(self) -> tuple[FloatArray, FloatArray]:
         """Derivatives of a number, by its outputs, by the modes (m, n + 1) and the source (n + 1,) at all times."""
-        m, run, stack = self.m, self.run, self.problem.network.stack
+        m, run, by, stack = self.m, self.run, self.by, self.problem.network.stack
         ((_, contact),) = run.record.fingers
         assert run.u_gap is not None
         # By the gap voltage along the loop.
@@ -273,17 +259,17 @@ class _Intervals:
         by_u = by_u + by["f_el"] * contact.stress(1.0) * u * (2.0 - u * dq / q) / q
         of_modes, of_source = np.zeros((m, self.t.size)), np.zeros(self.t.size)
         place = np.searchsorted(self.t, run.t - self.slack)
-        for some in _parts_of(np.flatnonzero(by_u)):
+        counting = np.flatnonzero(by_u)
+        for some in np.split(counting, range(_AT_ONCE, counting.size, _AT_ONCE)):
             at = place[some]
             of_gap = by_u[some] * self._slopes(at, self.x[at], np.zeros(1), 1)[m + GAP]
             np.add.at(of_modes.T, at, of_gap[:m].T)
             np.add.at(of_source, at, of_gap[m] + of_gap[m + 1])
         return of_modes, of_source
 
-    def swept(self, by: Mapping[str, Any]) -> FloatArray:
+    def swept(self) -> FloatArray:
         """Derivatives of a number by the samples, with half the steps and with all, shape (2, n_sample)."""
-        self._divide(by)
-        t, m, wave, form, ((_, contact),) = self.t, self.m, self.wave, self.form, self.run.record.fingers
+        t, m, by, wave, form, ((_, contact),) = self.t, self.m, self.by, self.wave, self.form, self.run.record.fingers
         block, start = Block(form, self.x, self.h, True), form.start(self.problem)[0][:m]
         peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
         solved = block.solve(start, self.parts[2], _CLOSED * peak) and block.on_one_branch
@@ -296,13 +282,13 @@ class _Intervals:
         self.z, self.xi = np.column_stack([starts, block.end()[:m]]), block.xi.copy()
         sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
         self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
-        of_modes, by_outputs = self.outputs(by)
+        of_modes, by_outputs = self.outputs()
         n, means = t.size - 1, np.zeros((MORE, t.size - 1))
         of_source, after = np.tile(by_outputs, (2, 1)), np.tile(of_modes[:, n], (2, 1))
         means[SQUARES], means[AREAS] = by["f_el_mean"] * contact.stress(1.0), by["area_mean"]
         means *= (t[:-1] >= self.run.first - 1e-9 * (t[-1] - t[0])) / (t[-1] - self.run.first)
         rows = np.append(np.ones(m, bool), means.any(axis=1))
-        for at in reversed(_parts_of(np.arange(n))):
+        for at in reversed(np.split(np.arange(n), range(_AT_ONCE, n, _AT_ONCE))):
             a, b = at[0], at[-1] + 1
             own = np.ascontiguousarray(means[:, a:b]), np.ascontiguousarray(of_modes[:, a:b])
             for row, found in enumerate(self.slopes(at, rows)):
@@ -317,9 +303,9 @@ class _Intervals:
         out, place = np.zeros((2, wave.count)), np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)
         first = np.minimum(np.floor(place + 1e-6), wave.count - 2.0).astype(np.int64)
         beyond = np.maximum(place - first, 0.0)
-        for row in range(2):
-            np.add.at(out[row], first, (1.0 - beyond) * of_source[row])
-            np.add.at(out[row], np.minimum(first + 1, wave.count - 1), beyond * of_source[row])
+        for samples, found in zip(out, of_source, strict=True):
+            np.add.at(samples, first, (1.0 - beyond) * found)
+            np.add.at(samples, np.minimum(first + 1, wave.count - 1), beyond * found)
         return out
 
 
@@ -330,19 +316,13 @@ def _problem(run: Solution, sources: dict[str, Waveform]) -> Problem:
     return asked(circuit, start=run.start, charge=False, rtol=run.rtol, **how)
 
 
-def _parts_of(numbers: IntArray) -> list[IntArray]:
-    """Rows of numbers, as many at once as memory is kept for."""
-    return [numbers[a : a + _AT_ONCE] for a in range(0, numbers.size, _AT_ONCE)]
-
-
 def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradient:
     """See `Solution.sample_gradient`."""
-    if run.stored is not None or run.start == "given":
-        allowed = "a run just made from its circuit's own start"
-        raise InputError(f"{_ASKED}the run goes on from another one or was read from a file; allowed: {allowed}")
+    said = f"{_ASKED}the run goes on from another one or was read from a file; allowed: a run just made"
+    refuse(run.stored is not None or run.start == "given", f"{said} from its circuit's own start")
     refuse(run.failure is not None, f"{_ASKED}the run failed; allowed: a run to its end")
-    one = _Intervals(run)
-    coarse, fine = one.swept(_weights(run, of))
+    one = _Intervals(run, of)
+    coarse, fine = one.swept()
     largest = float(np.abs(fine).max())
     error = float(np.abs(fine - coarse).max()) + run.rtol * largest
     if error > _ALLOWED * run.rtol * largest:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,39 +36,28 @@ CHUNK, WINDOW = 10.0, 1 << 14
 Mark = dict[str, Any]
 
 
-@dataclass(frozen=True)
 class Outputs:
-    """Output times, evenly spaced."""
+    """Output times, evenly spaced: at the samples of a recording, or every `step` (s); else the deck's TSTEP apart."""
 
-    # start, over: Time of output number 0, s, and spacing, s; if `rated`, `over` is the rate of a recording, Hz
-    start: float
-    over: float
-    rated: bool  # Whether the outputs are at the samples of a recording
-    # low, total: Number of the first output, and how many outputs there are
-    low: int
-    total: int
-    stop: float  # End of the run, s
+    def __init__(self, problem: Problem, step: float | None) -> None:
+        wave, first, self.stop = problem.network.waveform, max(problem.first, problem.t_start), problem.t_stop
+        # Number of the first output, and how many there are; time of output number 0, s, and spacing of all, s.
+        self.low, self.start, self.spacing = 0, first, problem.step if step is None else step
+        # Of a recording, whose samples are the outputs.
+        self.rate: float | None = None
+        if step is None and isinstance(wave, Samples):
+            self.start, self.spacing, self.rate = wave.start, 1.0 / wave.rate, wave.rate
+            self.low = math.ceil((first - wave.start) * wave.rate - 1e-6)
+            self.total = math.floor((self.stop - wave.start) * wave.rate + 1e-6) - self.low + 1
+        else:
+            self.total = math.floor((self.stop - first) / self.spacing * (1.0 + 1e-12) + 1e-9) + 1
+        require(self.total >= 1, "the run", f"one of {self.stop - first:g} s without any output", "a longer one")
 
     def times(self, i: int, j: int) -> FloatArray:
         """Times of outputs i to j - 1, s, rounded as ``start + arange / rate`` or ``start + step * arange`` are."""
         number = np.arange(self.low + i, self.low + min(j, self.total))
-        t = self.start + (number / self.over if self.rated else self.over * number)
+        t = self.start + (self.spacing * number if self.rate is None else number / self.rate)
         return np.asarray(np.minimum(t, self.stop))
-
-
-def outputs_of(problem: Problem, step: float | None) -> Outputs:
-    """The outputs at the samples of a recording, or every `step` (s); the deck's TSTEP where there is no recording."""
-    wave, first, stop = problem.network.waveform, max(problem.first, problem.t_start), problem.t_stop
-    if step is None and isinstance(wave, Samples):
-        low = math.ceil((first - wave.start) * wave.rate - 1e-6)
-        total = math.floor((stop - wave.start) * wave.rate + 1e-6) - low + 1
-        found = Outputs(wave.start, wave.rate, True, low, total, stop)
-    else:
-        step = problem.step if step is None else step
-        total = math.floor((stop - first) / step * (1.0 + 1e-12) + 1e-9) + 1
-        found = Outputs(first, step, False, 0, total, stop)
-    require(found.total >= 1, "the run", f"one of {stop - first:g} s without any output", "a longer one")
-    return found
 
 
 class Stream:
@@ -175,10 +164,10 @@ class Stream:
         """Times (s) and rows of the next piece of a recording."""
         piece, o, last = self._pieces[self._place], self.outputs, self._place + 1 == len(self._pieces)
         # All outputs up to the end of the piece, and a few more.
-        number = (piece.stop - o.start) * o.over if o.rated else (piece.stop - o.start) / o.over
-        end = o.total if last else min(max(math.ceil(number) - o.low + 2, self._written), o.total)
-        t = o.times(self._written, end)
-        run_at = t if o.rated else at_breakpoints(replace(self.problem, t_start=piece.start, t_stop=piece.stop), t)
+        end = math.ceil((piece.stop - o.start) / o.spacing) - o.low + 2
+        t = run_at = o.times(self._written, o.total if last else max(end, self._written))
+        if o.rate is None:
+            run_at = at_breakpoints(replace(self.problem, t_start=piece.start, t_stop=piece.stop), t)
         out = march.outputs_at(run_at)
         try:
             march.follow(piece, run_at, out)
@@ -227,16 +216,17 @@ class Stream:
             run.status, run.t_failed = Status.SUCCESS, None
         shown = problem.scene.shown
         span = (float(t[0]), float(t[-1])) if t.size else (problem.t_start, problem.t_start)
-        network = within(shown.network, *span)
-        record = Record(network, shown.net, t, np.zeros(t.size, bool), rows, problem.charge)
+        record = Record(within(shown.network, *span), shown.net, t, np.zeros(t.size, bool), rows, problem.charge)
         found = solution_of(problem, self.plan, run, record, t, self.rtol, self._method)
         return replace(found, first=span[0], t_stop=span[1])
 
 
 def within(network: Network, t0: float, t1: float) -> Network:
     """The network with its recordings cut to the samples needed from t0 to t1, s."""
-    cut = ((e, e.waveform.part(t0, t1) if isinstance(e.waveform, Samples) else e.waveform) for e in network.sources)
-    return replace(network, sources=tuple(replace(e, waveform=wave) for e, wave in cut))
+    cut = (
+        replace(e, waveform=e.waveform.part(t0, t1)) if isinstance(e.waveform, Samples) else e for e in network.sources
+    )
+    return replace(network, sources=tuple(cut))
 
 
 def stream(
@@ -300,10 +290,9 @@ def stream(
     circuit = overridden(circuit, sources, parameters)
     problem = asked(circuit, t_stop=t_stop, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol)
     check_length(problem.network.waveform, problem.t_start, problem.t_stop)
-    outputs = outputs_of(problem, step)
+    outputs = Outputs(problem, step)
     if count is None:
-        spacing = 1.0 / outputs.over if outputs.rated else outputs.over
-        count = max(1, round((CHUNK if chunk is None else chunk) / spacing))
+        count = max(1, round((CHUNK if chunk is None else chunk) / outputs.spacing))
     count = min(count, outputs.total)
     check_outputs(circuit, count)
     return Stream(problem, make_plan(problem, rtol, tier, method), outputs, count, rtol, method)

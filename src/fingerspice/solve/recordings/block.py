@@ -107,9 +107,7 @@ class Block:
         self.kept = _scratch("kept", self.m + int(form.mobile), PIECES, self.count + 1)
         self.left = np.zeros(self.m)
         # Durations of the pieces, s.
-        self.lengths = np.full(PIECES, self.count * self.h[0])
-        if self.own:
-            self.lengths = self.h.reshape(PIECES, self.count).sum(axis=1)
+        self.lengths = self.h.reshape(PIECES, -1).sum(axis=1) if self.own else np.full(PIECES, self.count * self.h[0])
         self.decay = np.exp(-self.rates[:, None] * self.lengths)  # (m, pieces): Left of modes after each piece
 
     def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
@@ -161,9 +159,9 @@ class Block:
             starts[:active] += change
         else:
             return False
-        for k in range(active, self.m):
-            # Passive modes have begun at 0 in every piece.
-            self.kept[k] += np.cumsum(np.append(start[k], self.kept[k, :-1, -1]))[:, None]
+        # Passive modes have begun at 0 in every piece.
+        passive = self.kept[active : self.m]
+        passive += np.cumsum(np.column_stack([start[active : self.m], passive[:, :-1, -1]]), axis=1)[..., None]
         self.xi = _scratch("xi", self.x.size)
         show(form.xi[None], self.x, self.first, self.count, 0, self.n + 1, self.kept, self.xi[None])
         self.xi[self.n + 1 :] = self.xi[self.n]
@@ -242,7 +240,7 @@ class Block:
         inverse = form.inverse_area(between)
         if form.mobile:
             u = inverse.max(axis=0) / c.q0 / self.margin
-            of_inverse = np.abs(form.slope(between)) * u
+            of_inverse = np.abs(form.polynomial(c.slope, between)) * u
             moved = (float(np.abs(self.x).max()) * of_inverse / inverse**2).max(axis=0)
             of_inverse, rises, rises_at_first = of_inverse.max(axis=0), rises * u, rises_at_first * u
         else:
@@ -270,10 +268,25 @@ class Block:
         return np.array([*errors, found[:nodes].max(initial=0.0), found[nodes:].max(initial=0.0)])
 
     def _check(self, parts: int) -> _Window:
-        """Follow a window of every piece by twice as many steps."""
-        width, lanes = self.width, np.arange(PIECES)
+        """Follow windows of every piece by twice as many steps: at large moves of the source, under N at large |xi|."""
+        most, width, lanes = self.moves.T, self.width, np.arange(PIECES)
+        # Windows end before the last sample.
+        most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
+        # Where windows begin in each piece, -1 for none.
+        place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
+        # Windows of a piece, each by how much the source moves in it: the errors of kinks grow with its square.
+        squares = (np.maximum(most, 0.0) / np.maximum(most.max(axis=1, keepdims=True), 1e-300)) ** 2
+        self.busy = np.maximum(self.count / (width * most.shape[1]) * np.stack([squares, squares**2]).sum(axis=-1), 1.0)
+        if self.starts_run:
+            place[0] = 0
+        places = [place]
+        if self.form.bent:
+            ends = np.minimum(self.count, self.n - self.first) - width
+            largest = np.argmax(np.abs(self.xi[:-1]).reshape(PIECES, self.count), axis=1)
+            largest = np.minimum(largest - width // 2, ends)
+            places.append(np.where(place >= 0, np.maximum(largest, 0), -1))
         off, z, at, inside = np.empty(0), np.empty(0), lanes, np.arange(width + 1)
-        for number, place in enumerate(self._windows()):
+        for number, place in enumerate(places):
             first = np.maximum(place, 0)
             coarse = self.kept[:, lanes[:, None], first[:, None] + inside]
             fine = np.empty(coarse.shape)
@@ -290,24 +303,6 @@ class Block:
         inside = (at + self.first)[:, None] + inside
         took = self.h[inside[:, :-1]].sum(axis=1) if self.own else np.full(PIECES, width * self.h[0])
         return _Window(z, off, self.x[inside], self.xi[inside], took)
-
-    def _windows(self) -> list[IntArray]:
-        """Where windows begin in each piece, -1 for none: at large moves of the source, under N at large |xi|, too."""
-        most, width = self.moves.T, self.width
-        # Windows end before the last sample.
-        most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
-        place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
-        # Windows of a piece, each by how much the source moves in it: the errors of kinks grow with its square.
-        squares = (np.maximum(most, 0.0) / np.maximum(most.max(axis=1, keepdims=True), 1e-300)) ** 2
-        self.busy = np.maximum(self.count / (width * most.shape[1]) * np.stack([squares, squares**2]).sum(axis=-1), 1.0)
-        if self.starts_run:
-            place[0] = 0
-        if not self.form.bent:
-            return [place]
-        ends = np.minimum(self.count, self.n - self.first) - width
-        largest = np.argmax(np.abs(self.xi[:-1]).reshape(PIECES, self.count), axis=1)
-        largest = np.minimum(largest - width // 2, ends)
-        return [place, np.where(place >= 0, np.maximum(largest, 0), -1)]
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
         """Source (V; n,) and states (rows, n) `since` (s) after samples with these numbers, in `parts` steps."""
@@ -347,12 +342,9 @@ class Piece:
 
     def values(self, wave: Samples | PWL) -> FloatArray:
         """The source at the limits of the steps, V."""
-        if self.times is not None:
-            return wave.value(self.times)
-        assert isinstance(wave, Samples)
-        if self.first == self.last:
-            return wave.value([self.start, self.start + self.spacing])
-        return wave.between(self.first, self.last + 1)
+        if isinstance(wave, Samples) and self.first < self.last:
+            return wave.between(self.first, self.last + 1)
+        return wave.value([self.start, self.start + self.spacing] if self.times is None else self.times)
 
 
 def driving(problem: Problem) -> tuple[int, Samples | PWL | None]:
@@ -382,23 +374,18 @@ def ready(problem: Problem, rtol: float) -> LaneForm | None:
 def _points(problem: Problem, wave: PWL) -> FloatArray:
     """Times (s) of a run's points and ends, and more on long lines, kept for the last run; empty if not dense."""
     t0, t1 = problem.t_start, problem.t_stop
-    return wave.remember(("points", t0, t1), lambda: _dense(wave.knots[0], t0, t1), 1)
 
+    def dense() -> FloatArray:
+        t, slack = wave.knots[0], 1e-6 * (t1 - t0) / wave.knots[0].size
+        inside = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
+        intervals = np.diff(inside)
+        if inside.size < LEAST_POINTS or not np.all(intervals > 0.0):
+            return np.empty(0)
+        parts = np.cumsum(np.append(0.0, np.ceil(intervals / (LONGEST * np.median(intervals)))))
+        few = parts[-1] <= 2 * inside.size
+        return np.interp(np.arange(parts[-1] + 1.0), parts, inside) if few else np.empty(0)
 
-def _dense(t: FloatArray, t0: float, t1: float) -> FloatArray:
-    slack = 1e-6 * (t1 - t0) / t.size
-    inside = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
-    intervals = np.diff(inside)
-    if inside.size < LEAST_POINTS or not np.all(intervals > 0.0):
-        return np.empty(0)
-    parts = np.ceil(intervals / (LONGEST * np.median(intervals))).astype(int)
-    if parts.sum() > 2 * inside.size:
-        return np.empty(0)
-    if parts.sum() == parts.size:
-        return inside
-    before = np.repeat(np.concatenate([[0], np.cumsum(parts)[:-1]]), parts)
-    share = (np.arange(before.size) - before) / np.repeat(parts, parts)
-    return np.append(np.repeat(inside[:-1], parts) + share * np.repeat(intervals, parts), t1)
+    return wave.remember(("points", t0, t1), dense, 1)
 
 
 def spacing_of(wave: Samples | PWL) -> float:

@@ -23,9 +23,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
@@ -51,9 +51,9 @@ from fingerspice.waveforms.samples import Samples
 
 # Number of lanes, each with a piece of a recording.
 PIECES = 64
-# Numbers of active modes that code is compiled for, as a new one takes 15 to 30 s: others get modes that stay at 0; and
-# fewest leaks, of which the rest stays at 0, too.
-SIZES, LEAST_LEAKS = (2, 4, 7, 10, 14, 20, 28, 40, 56), 2
+# Numbers of active modes that code is compiled for, as a new one takes 15 to 30 s: others get modes that stay at 0; the
+# fewest in a network; and fewest leaks, of which the rest stays at 0, too.
+SIZES, LEAST_MODES, LEAST_LEAKS = (2, 4, 7, 10, 14, 20, 28, 40, 56), 4, 2
 # Relative error from which on steps in a stack have Simpson's nodes, and need two evaluations in the place of three.
 BY_SIMPSON = 1e-5
 # Largest degree of the polynomial for 1/A.
@@ -70,8 +70,6 @@ _FREQUENCIES = 65
 # Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
 # what they leave together is known but for about 1e-8.
 OF_MANY, ACTING = 1e-7, 0.05
-# Fewest active modes that code is compiled for.
-LEAST_MODES = 4
 # Reference area: that at this share of the largest gap voltage to expect.
 _TYPICAL = 0.5
 
@@ -95,7 +93,7 @@ class LaneForm(ABC):
     inner: int  # Number of nodes within a step
     mobile: bool  # Charge law
     rows: Shown  # What is recorded: voltages, and the charges
-    nodes: Shown
+    judged: Shown  # What has an error of its own beside gap voltage and force: voltages of the nodes, and the charges
     flows: int  # Number of charges, whose rates are recorded, too
     stress: float  # Force per area and squared gap voltage, Pa/V^2
     gain: float  # Largest gap voltage to expect for a peak of the source of 1, V/V or V/A
@@ -117,18 +115,36 @@ class LaneForm(ABC):
         """Rows of a record from `out` (., n), the values of `rows` and the charges' rates."""
         return out.T
 
-    @cached_property
-    def judged(self) -> Shown:
-        """What has an error of its own beside gap voltage and force: voltages of the nodes, and the charges."""
-        charges = self.rows.k.size - self.flows
-        return Shown(*(np.concatenate([a, b[charges:]]) for a, b in zip(self.nodes, self.rows, strict=True)))
-
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
         leaks = self.lanes.tap_s.size
         kind = of_lanes.MobileMarks if self.mobile else of_lanes.NetworkMarks if self.bent else of_lanes.StackMarks
         sizes = self.lanes.rates.size, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks
         return kind(*((0,) * size for size in (*sizes, int(self.mobile), PIECES, int(own))))
+
+    def roomy(self, least: int = 1) -> Self:
+        """The form for as many modes and leaks as code is compiled for, with the charges behind the nodes in `judged`.
+
+        What modes are multiplied with may leave out the passive ones at its end.
+        """
+        lanes, n, leaks, rows = self.lanes, self.active, self.lanes.tap_s.size, self.rows
+        active, more = next((size for size in SIZES if size >= max(n, least)), n), [leaks] * max(LEAST_LEAKS - leaks, 0)
+
+        def wide(x: FloatArray) -> FloatArray:
+            out = np.zeros((*x.shape[:-1], active + self.lanes.rates.size - n))
+            out[..., :n], out[..., active : active + x.shape[-1] - n] = x[..., :n], x[..., n:]
+            return out
+
+        lanes = lanes._replace(
+            rates=wide(lanes.rates), gain=wide(lanes.gain), shape=wide(lanes.shape),
+            taps=wide(np.insert(lanes.taps, more, 0.0, axis=0)), tap_s=np.insert(lanes.tap_s, more, 0.0),
+            bent=np.insert(lanes.bent, more, 0.0), kinks=np.insert(lanes.kinks, more, 0.0),
+            feed=wide(np.insert(lanes.feed, more, 0.0, axis=1).T).T.copy(),
+        )  # fmt: skip
+        rows, nodes = (shown._replace(columns=wide(shown.columns)) for shown in (rows, self.judged))
+        charges = rows.k.size - self.flows
+        judged = Shown(*(np.concatenate([a, b[charges:]]) for a, b in zip(nodes, rows, strict=True)))
+        return replace(self, lanes=lanes, active=active, rows=rows, judged=judged)
 
     @property
     def bent(self) -> bool:
@@ -147,22 +163,19 @@ class LaneForm(ABC):
         """Weights of steps of the lengths h (s), shape (n,), into `out` (rows, n)."""
         of_lanes.weigh(self.lanes, self.active, self.inner, h, out)
 
-    def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
+    def polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
+        """One of `lanes` at xi (V)."""
         c, flat, out = self.lanes, np.ravel(xi), np.empty(np.size(xi))
         polynomial_of(powers, c.scale, c.shift, flat, out)
         return out.reshape(np.shape(xi))
 
     def inverse_area(self, xi: FloatArray) -> FloatArray:
         """1/A, 1/m^2."""
-        return np.asarray(self.lanes.q0 + self._polynomial(self.lanes.area, xi))
-
-    def slope(self, xi: FloatArray) -> FloatArray:
-        """Derivative of 1/A by |xi|, 1/m^2/V."""
-        return self._polynomial(self.lanes.slope, xi)
+        return np.asarray(self.lanes.q0 + self.polynomial(self.lanes.area, xi))
 
     def bend(self, xi: FloatArray) -> FloatArray:
         """N, V m^2."""
-        found = self._polynomial(self.lanes.bend, xi)
+        found = self.polynomial(self.lanes.bend, xi)
         return np.negative(found, out=found, where=xi < 0.0)
 
     def gap(self, xi: FloatArray) -> FloatArray:
@@ -193,9 +206,14 @@ class LaneForm(ABC):
         """xi (V) at modes as in `start`."""
         return float(self.xi[0] * source + self.xi[1:] @ z)
 
+    def held_at(self, z: FloatArray, xi: float, source: float) -> FloatArray:
+        """What `rows` show (C,) of modes as in `start`; under `mobile` but for what depends on the area."""
+        rows, bend = self.rows, 0.0 if self.mobile else self.bend(np.array(xi))
+        return np.asarray(rows.columns @ z[: self.lanes.rates.size] + rows.bends * bend + rows.k * source)
+
     def after(self, z: FloatArray, to: float) -> float:
-        """Gap voltage (V) after a jump of the source to `to`; NaN where it meets a fold."""
-        return float(self.gap(np.array(self.xi_at(z, to))))
+        """xi (V) after a jump of the source to `to`; of a stack under `mobile`, NaN where it meets a fold."""
+        return self.xi_at(z, to)
 
 
 def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
@@ -215,16 +233,15 @@ def curves(
     """The polynomials of `Lanes` and what goes with them, up to the gap voltage `top` (V), and `LaneForm.missed` and
     `missed_bend`; None where no allowed degree is enough for errors of `rtol`."""
     tol = _AREA_SHARE * min(rtol, _COARSEST)
-    at = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
-    to_series = np.linalg.inv(_chebyshev(at, _POINTS))
-    area = to_series @ (1.0 / inverse_area_array(0.5 * top * (at + 1.0), curve)[0])
+    at = series_of.chebpts1(_POINTS)
+    to_series, u = np.linalg.inv(series_of.chebvander(at, _POINTS - 1)), 0.5 * top * (at + 1.0)
+    area = to_series @ (1.0 / inverse_area_array(u, curve)[0])
     integral = series_of.chebint(area, lbnd=-1.0) * 0.5 * top
     # The range of xi ends where the gap voltage reaches `top`.
     xi_top = float(top + kappa * (integral.sum() - top / q0))
-    xi = 0.5 * xi_top * (at + 1.0)
-    u = xi * top / xi_top
+    xi = u * xi_top / top
     for _ in range(50):
-        basis = _chebyshev(2.0 * u / top - 1.0, _POINTS + 1)
+        basis = series_of.chebvander(2.0 * u / top - 1.0, _POINTS)
         n, a = basis @ integral - u / q0, basis[:, :-1] @ area
         step = (u + kappa * n - xi) / (1.0 + kappa * (a - 1.0 / q0))
         if np.abs(step).max() <= 1e-15 * top:
@@ -248,38 +265,26 @@ def curves(
     return found, off_one / abs(float(inverse[0])), off_other
 
 
-def _chebyshev(x: FloatArray, count: int) -> FloatArray:
-    """The first Chebyshev polynomials at x (n,) from -1 to 1, shape (n, count)."""
-    return np.asarray(np.cos(np.arange(count) * np.arccos(np.clip(x, -1.0, 1.0))[:, None]))
-
-
 @dataclass(frozen=True)
 class StackForm(LaneForm):
     """A stack prepared for recordings; the charge is its last mode, where it is wanted."""
 
     system: System
 
-    def _rest(self, z: FloatArray, u_gap: float, source: float) -> float:
-        """The charge (C) but for its mode, and under `mobile` but for A s."""
-        charge = self.rows.columns[-1, : self.active] @ z[: self.active] + self.rows.k[-1] * source
-        return float(charge + (0.0 if self.mobile else self.rows.bends[-1] * self.bend(np.array([u_gap]))[0]))
-
     def start(self, problem: Problem) -> tuple[FloatArray, float]:
         (y, u_gap), z, before = problem.inner, np.zeros(self.lanes.rates.size), float(problem.initial.s_before[0])
         z[: y.size - 1] = self.system.project[0] @ y[:-1]
         if self.flows:
-            z[self.active] = y[-1] - self._rest(z, u_gap, before)
+            z[self.active] = y[-1] - self.held_at(z, u_gap, before)[-1]
         return np.append(z, u_gap) if self.mobile else z, before
 
     def after(self, z: FloatArray, to: float) -> float:
-        if not self.mobile:
-            return super().after(z, to)
         model = self.system.model
         return float(ramp(model, model.k_gap * to, dot(self.system.gap[0], z), float(z[-1])))
 
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
         (y, _), u_gap = problem.inner, self.xi_at(z, u_last)
-        charge = z[self.active] + self._rest(z, u_gap, u_last) if self.flows else y[-1]
+        charge = self.held_at(z, u_gap, u_last)[-1] if self.flows else y[-1]
         y = np.append(self.system.live[0] @ z[: y.size - 1], charge)
         u_gap = gap_at(self.system.model, y, u_last, math.copysign(1.0, u_gap), u_gap)
         return from_loop(problem.scene, t, y, u_last, u_gap)
@@ -313,35 +318,16 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
     if problem.charge:
         column, stored, gain_of, feed_of, moved = _charge(system, stack)
         rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])
-        columns, nodes, taps = (np.pad(rows, ((0, 0), (0, 1))) for rows in (columns, nodes, taps))
-        columns, shape = np.vstack([columns, np.append(column, 1.0)]), np.append(shape, 0.0)
+        columns = np.vstack([np.pad(columns, ((0, 0), (0, 1))), np.append(column, 1.0)])
         k, moves = np.append(k, stored), np.append(moves, moved)
     own = rates, gain, shape, float(model.k_gap), taps, tap_s, np.zeros(tap_s.size), feed
     shown = Shown(columns, k, moves, (np.arange(k.size) < system.k_shown.size) & model.mobile)
     of_nodes = Shown(nodes, system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile))
-    lanes, active, shown, of_nodes = roomy(Lanes(*own, kinks=kinks, fast=0, **curve), n, shown, of_nodes)
     return StackForm(
-        lanes, active, 1 if rtol >= BY_SIMPSON else 2, model.mobile, shown, of_nodes, int(problem.charge),
-        system.stress, float(model.k_gap), system.u_top, missed, missed_bend, float(model.slow[-3]) * area0, system,
-    )  # fmt: skip
-
-
-def roomy(lanes: Lanes, n: int, rows: Shown, nodes: Shown, least: int = 1) -> tuple[Lanes, int, Shown, Shown]:
-    """Constants of n active modes and the others, for as many modes and leaks as code is compiled for; their number."""
-    active, leaks = next((size for size in SIZES if size >= max(n, least)), n), lanes.tap_s.size
-    more = [leaks] * max(LEAST_LEAKS - leaks, 0)
-
-    def wide(x: FloatArray) -> FloatArray:
-        still = np.zeros((*x.shape[:-1], active - n))
-        return np.concatenate([x[..., :n], still, x[..., n:]], axis=-1)
-
-    lanes = lanes._replace(
-        rates=wide(lanes.rates), gain=wide(lanes.gain), shape=wide(lanes.shape),
-        taps=wide(np.insert(lanes.taps, more, 0.0, axis=0)), tap_s=np.insert(lanes.tap_s, more, 0.0),
-        bent=np.insert(lanes.bent, more, 0.0), kinks=np.insert(lanes.kinks, more, 0.0),
-        feed=wide(np.insert(lanes.feed, more, 0.0, axis=1).T).T.copy(),
-    )  # fmt: skip
-    return lanes, active, rows._replace(columns=wide(rows.columns)), nodes._replace(columns=wide(nodes.columns))
+        Lanes(*own, kinks=kinks, fast=0, **curve), n, 1 if rtol >= BY_SIMPSON else 2, model.mobile, shown, of_nodes,
+        int(problem.charge), system.stress, float(model.k_gap), system.u_top, missed, missed_bend,
+        float(model.slow[-3]) * area0, system,
+    ).roomy()  # fmt: skip
 
 
 def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:
@@ -387,16 +373,20 @@ class Reduced:
         by = by_modes(network, modes, area0)
         tap, tap_s = by["tap"], by["tap_s"]
         lost, lost_s, stored, stored_s = (by[name][:n_s] for name in ("lost", "lost_s", "stored", "stored_s"))
-        # The cells whose area moves, and the direction of each along their path, relative to that of the gap.
+        # The cells whose area moves, and the direction of each along their path, relative to that of the gap: 1 or -1,
+        # by the current that leaves nothing at the nodes inside the path.
         fed = np.flatnonzero(net.place == self.moving)
-        turn = _turns([network.cells[i].nodes for i in fed], int(np.flatnonzero(fed == self.gap)[0]))
+        pairs = [network.cells[i].nodes for i in fed]
+        ends = Counter(node for pair in pairs for node in pair)
+        inner = [[(a == node) - (b == node) for a, b in pairs] for node, count in ends.items() if count == 2]
+        current = np.linalg.svd(np.array(inner, float).reshape(-1, fed.size))[2][-1]
+        turn = np.round(current / current[fed == self.gap])
         # f c_gap of the module: v = w + absorbed N. Behind an ideal source kappa is 0, or rounding.
         self.absorbed = -modes.take[:, fed] @ turn * net.c[self.gap]
         self.kappa = max(-float(tap[self.gap] @ self.absorbed), 0.0)
         # The voltages of those of them that have a fixed leak, from w and the source: what 1/A - q0 multiplies.
         leaking = fed[net.g_total[fed] > 0.0]
-        taps, self.tap_s = tap[leaking], tap_s[leaking, source]
-        self.taps, self.bent = np.pad(taps, ((0, 0), (0, n_s))), taps @ self.absorbed
+        self.taps, self.tap_s, self.bent = tap[leaking], tap_s[leaking, source], tap[leaking] @ self.absorbed
 
         def leaks(through: FloatArray) -> FloatArray:
             """Forcing by (q - q0) times each of these voltages; `through` (rows, n_f) is that by the currents."""
@@ -416,7 +406,7 @@ class Reduced:
         by_bend = np.append(-modes.rates * self.absorbed, np.zeros(n_s))
         self.feed = np.column_stack([np.vstack([by_leaks, leaks(through[:, fed]) + over @ by_leaks]), by_bend])
         # xi from w and the source; state voltages and charges from w, N and the source; voltages of the nodes.
-        self.shape, self.k = np.append(tap[self.gap], np.zeros(n_s)), float(tap_s[self.gap, source])
+        self.shape, self.k = tap[self.gap], float(tap_s[self.gap, source])
         moved = stored @ self.absorbed + through[:, fed] @ turn * net.c[self.gap]
         self.rows = Shown(
             np.block([[modes.shape, none], [stored - over, np.eye(n_s)]]),
@@ -424,32 +414,21 @@ class Reduced:
             np.append(modes.shape @ self.absorbed, moved), np.zeros(n + n_s, bool),
         )  # fmt: skip
         nodes, still = by["node"], np.zeros(len(by["node"]))
-        self.nodes = Shown(np.pad(nodes, ((0, 0), (0, n_s))), still, nodes @ self.absorbed, still > 0.0)
-
-
-def _turns(nodes: list[tuple[str, str]], first: int) -> FloatArray:
-    """Direction of each cell of a path, 1 or -1, relative to that of cell `first`: a current that all of them carry."""
-    ends = Counter(node for pair in nodes for node in pair)
-    inner = [[(a == node) - (b == node) for a, b in nodes] for node, count in ends.items() if count == 2]
-    current = np.linalg.svd(np.array(inner, float).reshape(-1, len(nodes)))[2][-1]
-    return np.asarray(np.round(current / current[first]))
+        self.nodes = Shown(nodes, still, nodes @ self.absorbed, still > 0.0)
 
 
 def is_followed(scene: Scene, circuit: Circuit) -> bool:
-    """Whether a scene is a network with one area that moves, at once and under the local law, of cells in series."""
+    """Whether a network's scene has one area that moves, at once and under the local law, of cells in series."""
     net = scene.net
     moving = np.flatnonzero(net.gap >= 0)
-    if scene.network.stack is not None or net.mobile or moving.size != 1 or net.slow[moving[0]] >= 0:
+    if net.mobile or moving.size != 1 or net.slow[moving[0]] >= 0 or net.g_area[net.gap[moving[0]]] > 0.0:
         return False
-    cells = [cell for cell in scene.network.cells if cell.area == moving[0]]
-    if net.g_area[net.gap[moving[0]]] > 0.0:
-        return False
-    own = {cell.element.name: cell.element.nodes[:2] for cell in cells}
+    own = {cell.element.name: cell.element.nodes[:2] for cell in scene.network.cells if cell.area == moving[0]}
     ends = Counter(node for nodes in own.values() for node in nodes)
     every = Counter(node for e in circuit.elements for node in e.nodes[:2])
-    inner = [node for node, count in ends.items() if count == 2]
     # A path of k elements has k - 1 nodes inside, which nothing else touches, and two ends.
-    return len(ends) == len(own) + 1 and len(inner) == len(own) - 1 and all(every[node] == 2 for node in inner)
+    inner = [node for node, count in ends.items() if count == every[node] == 2]
+    return len(ends) - 1 == len(own) == len(inner) + 1
 
 
 @dataclass(frozen=True)
@@ -459,7 +438,7 @@ class NetworkForm(LaneForm):
     reduced: Reduced
 
     def start(self, problem: Problem) -> tuple[FloatArray, float]:
-        start, reduced, active, c = problem.initial, self.reduced, self.active, self.lanes
+        start, reduced, c = problem.initial, self.reduced, self.lanes
         n = reduced.absorbed.size
         x, s, net = start.y[:n], start.s_before, problem.scene.net
         u = xi = float(net.p[reduced.gap] @ x + net.q[reduced.gap] @ s)
@@ -470,15 +449,14 @@ class NetworkForm(LaneForm):
             xi -= step
             if abs(step) <= 1e-15 * abs(xi):
                 break
-        bend, z = float(self.bend(np.array(xi))), np.zeros(c.rates.size)
-        z[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * bend
-        held = self.rows.columns @ z + self.rows.bends * bend + self.rows.k * s[reduced.source]
-        z[active:] = start.y[n : n + self.flows] - held[n:]
-        return z, float(s[reduced.source])
+        z, source = np.zeros(c.rates.size), float(s[reduced.source])
+        z[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * self.bend(np.array(xi))
+        z[self.active :] = start.y[n : n + self.flows] - self.held_at(z, xi, source)[n:]
+        return z, source
 
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
-        shown, xi, y = self.rows, self.xi_at(z, u_last), problem.initial.y.copy()
-        y[: shown.k.size] = shown.columns @ z + shown.bends * float(self.bend(np.array(xi))) + shown.k * u_last
+        xi, y = self.xi_at(z, u_last), problem.initial.y.copy()
+        y[: self.rows.k.size] = self.held_at(z, xi, u_last)
         s, sign = np.zeros(len(problem.network.waveforms)), np.ones(problem.scene.net.gap.size)
         s[self.reduced.source], sign[self.reduced.moving] = u_last, 1.0 if xi >= 0.0 else -1.0
         return State(t, y, s, sign, problem.scene.charge_law)
@@ -508,7 +486,7 @@ def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> Network
     contact = problem.network.contacts[moving]
     if not one.decays or polynomials is None or contact is None:
         return None
-    shares = np.abs(one.shape[: one.absorbed.size] * one.absorbed)
+    shares = np.abs(one.shape * one.absorbed)
     fading = (one.modes.rates > FADED * wave.rate) & (shares > ACTING * one.kappa)
     if rtol < OF_MANY and np.count_nonzero(fading) > 1:
         return None
@@ -518,9 +496,8 @@ def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> Network
     kinks[-1] = 0.5 * curve["scale"] ** 2 * polyval(-1.0, polyder(curve["bend"], 2))
     fast = int(np.argmax(shares * one.modes.rates))
     own = one.rates, one.gain, one.shape, one.k, one.taps, one.tap_s, one.bent, one.feed
-    lanes = Lanes(*own, kinks=kinks, fast=fast, **curve)
-    lanes, active, rows, nodes = roomy(lanes, one.absorbed.size, one.rows, one.nodes, LEAST_MODES)
     return NetworkForm(
-        lanes, active, 2, False, rows, nodes, one.rates.size - one.absorbed.size, float(contact.stress(1.0)), share,
-        scene.u_top, missed, missed_bend, float(problem.network.capacitance(area0).sum()), one,
-    )  # fmt: skip
+        Lanes(*own, kinks=kinks, fast=fast, **curve), one.absorbed.size, 2, False, one.rows, one.nodes,
+        one.rates.size - one.absorbed.size, float(contact.stress(1.0)), share, scene.u_top, missed, missed_bend,
+        float(problem.network.capacitance(area0).sum()), one,
+    ).roomy(LEAST_MODES)  # fmt: skip

@@ -1,9 +1,7 @@
 """Recordings of one finger, block by block in lanes (`solve.recordings.block`), with stated errors.
 
-Runs under a recorded source, sample by sample, in pieces of fixed length.
-
-The error of each piece is judged at its end, independently of later pieces. Its outputs are therefore the same however
-long the run is, and whether all outputs are held in one array or streamed in chunks.
+A run is followed in pieces of fixed length. The error of each is judged at its end, independently of later pieces. Its
+outputs are therefore the same however long the run is, and whether all are held in one array or streamed in chunks.
 """
 
 from __future__ import annotations
@@ -119,11 +117,10 @@ class LaneMarch:
             piece = replace(piece, times=piece.start + share * span)
             values = values[0] + share * (values[-1] - values[0])
         h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
-        starts_at = self.form.after(self.z, float(values[0]))
         tries = self.steps == 0 and self.rtol < AT_ONCE[self.form.bent] and values.size > 4 * FIRST
         for size in (FIRST, values.size - 1)[0 if tries else 1 :]:
             block = Block(self.form, values[: size + 1], h[:size], self.steps == 0)
-            seen, excess = self._climb(block, starts_at, LEAST_AT_START if piece.grows else LEAST_PEAK)
+            seen, excess = self._climb(block, LEAST_AT_START if piece.grows else LEAST_PEAK)
         parts, self.peak = PARTS[self.level], max(float(block.peaks.max()), self.peak)
         self.errors = np.maximum(seen.errors, self.errors)
         self.alike, self.chance, self.margin = seen.alike, seen.chance, min(self.margin, block.margin)
@@ -135,7 +132,7 @@ class LaneMarch:
         elif excess < COARSER and self.level > 0:
             self.level -= 1
 
-    def _climb(self, block: Block, starts_at: float, share: float) -> tuple[Judged, float]:
+    def _climb(self, block: Block, share: float) -> tuple[Judged, float]:
         """Solve a block, with ever more steps until its error is met; the errors, and the excess of those stated."""
         form = self.form
         while True:
@@ -147,7 +144,7 @@ class LaneMarch:
             if solved:
                 peak = float(block.peaks.max())
                 # Under `mobile` the run stays on the branch on which it starts.
-                near = not form.mobile or abs(block.xi[0] - starts_at) <= 0.01 * peak
+                near = not form.mobile or abs(block.xi[0] - form.after(self.z, float(block.x[0]))) <= 0.01 * peak
                 if not (near and block.on_one_branch and form.gap(np.array(peak)) <= form.u_top):
                     raise LostError
                 peak = max(peak, self.peak)
