@@ -1,7 +1,4 @@
-"""Errors of wrong input, with their place in a netlist, and warnings.
-
-The other error that users meet, of a solve that did not reach its end, is `fingerspice.results.outcome.SolveError`.
-"""
+"""Errors of wrong input, with their place in a netlist, and warnings; that of a solve is in `results.outcome`."""
 
 from __future__ import annotations
 

@@ -34,10 +34,7 @@ from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, requ
 
 
 def remembering(circuit: Circuit, name: str, values: Mapping[str, Any]) -> Circuit:
-    """The circuit, which remembers that the set of that name gave these values, by path.
-
-    An earlier set no longer answers for the values that this one replaces.
-    """
+    """The circuit, which remembers that the set of that name, and no earlier one, gave these values, by path."""
     given = {path.lower() for path in values}
     sets = {one: {p: v for p, v in old.items() if p.lower() not in given} for one, old in circuit.sets.items()}
     own = {**sets.pop(name, {}), **values}
@@ -105,20 +102,14 @@ def _own_text(source: Element) -> str:
 
 
 def drive_text(circuit: Circuit) -> str:
-    """Every source that is not 0 with its waveform: ``Vdrive: Sine(200 V, 100 Hz)``.
-
-    Sources that were replaced are left out, since `changes_text` lists them.
-    """
+    """Every source that is not 0 with its waveform, but for those in `changes_text`: ``V1: Sine(200 V, 100 Hz)``."""
     replaced = {path.lower() for path in circuit.overrides} - _given_by_sets(circuit)
     on = (e for e in driving(circuit) if e.waveform not in (None, OFF) and e.name.lower() not in replaced)
     return _joined([f"{e.name}: {_own_text(e)}" for e in on])
 
 
 def changes_text(circuit: Circuit) -> str:
-    """Changes made after the deck was read, with the present values: ``Xgap.d = 5 um``; empty without changes.
-
-    Values that a set of parameters gave, and that still hold, are named by the set: ``set moist``.
-    """
+    """Changes since the deck was read, as ``Xgap.d = 5 um``, or by a set whose values still hold: ``set moist``."""
     said = [f"set {name}" for name, (kept, _) in in_force(circuit).items() if kept]
     now = {e.name.lower(): f"{e.name} = {_own_text(e)}" for e in circuit.elements if e.waveform is not None}
     now |= {path.lower(): f"{path} = {shown(p.value, p.unit)}" for path, p in circuit.parameters.items()}
@@ -441,10 +432,7 @@ def energy_outside(waveform: Waveform, t_stop: float, band: tuple[float, float] 
 
 
 def is_near(waveform: Waveform, t_stop: float, frequency: float) -> bool:
-    """Whether 99 % of a source's energy is within 5 % of a frequency (Hz), as of a carrier with a slow envelope.
-
-    In that band the skin's data change by 3 %.
-    """
+    """Whether 99 % of a source's energy is within 5 % of a frequency (Hz), where the skin's data change by 3 %."""
     if (found := _recorded(waveform, t_stop)) is not None:
         # A coarse look at a recording suffices if it finds a fifth of the energy more than half an octave away.
         (f, energy), blurred = found, 2.0 * found[0][1]

@@ -49,10 +49,7 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Network(Remembering):
-    """A connected network of capacitors, resistors, sources and layers. SI throughout.
-
-    n live states, one for each capacitor of the tree; n_s sources, voltage sources first.
-    """
+    """A connected network: n live states, one for each capacitor of the tree; n_s sources, voltages first. In SI."""
 
     sources: tuple[Element, ...]
     n_voltage: int  # Number of voltage sources among them
@@ -192,10 +189,7 @@ class Network(Remembering):
 
 
 def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
-    """The network of a circuit, or its refusal.
-
-    The voltage sources in `held` are added, to hold the voltages of nodes; they may close no loop of voltage sources.
-    """
+    """The network of a circuit, or its refusal; voltage sources `held` are added to hold nodes, and close no loop."""
     areas, carrying = find_branches(circuit)
     branches = [*carrying, *held]
     problem = ".options work=total holds the voltage across a series stack, and this circuit is none; allowed: work=gap"
@@ -375,10 +369,7 @@ class LinearScene(NamedTuple):
 
 
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
-    """The linear scene of a circuit's GAP, which has to be named if there are several.
-
-    Refused are names of no GAP, and networks with several sources, which have no common amplitude and frequency.
-    """
+    """The linear scene of a GAP, which has to be named if there are several, of a circuit with one source."""
     gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
     known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
     require(finger is None or finger.lower() in gaps, "finger", repr(finger), f"the name of a GAP, {known}")

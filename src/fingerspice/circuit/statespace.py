@@ -154,11 +154,9 @@ def count_of(circuit: Circuit) -> int:
 def _areas(circuit: Circuit) -> tuple[Area, ...]:
     layers, owners = [e for e in circuit.elements if e.spec.is_layer], dict[str, Element]()
     for gap in circuit.by_device("GAP"):
-        node = gap.nodes[2]
-        if node in owners:
-            both = f"{owners[node].name} and {gap.name} both drive the area node {gap.node_names[2]!r}"
-            raise InputError(f"{both}; allowed: one GAP per area", gap.where)
-        owners[node] = gap
+        first = owners.setdefault(gap.nodes[2], gap)
+        both = f"{first.name} and {gap.name} both drive the area node {gap.node_names[2]!r}"
+        refuse(first is not gap, f"{both}; allowed: one GAP per area", gap)
     at = _incidence(list(circuit.by_device("V", "I", "R", "C")))
     out = []
     for node, layer in {e.nodes[2]: e for e in reversed(layers)}.items():
@@ -261,8 +259,7 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
     refuse("0" not in at, "no element touches ground; allowed: one node must be 0 (or gnd)")
     reached = _ways(branches, "0")
     for node, (e, *_) in at.items():
-        if node not in reached:
-            raise InputError(f"node {named(node, e)} ({e.name}) is floating: nothing connects it to ground", e.where)
+        refuse(node not in reached, f"node {named(node, e)} ({e.name}) is floating: nothing connects it to ground", e)
     voltages = [e for e in branches if e.device == "V"]
     taken, _ = spanning_tree(e.nodes for e in voltages)
     if not all(taken):
@@ -358,8 +355,6 @@ class Stack(Remembering):
     @cached_property
     def grouping(self) -> FloatArray:
         """Matrix of 0 and 1 from live cells to recorded layers, shape (n_layer - 1, n_cell - 1)."""
-        if len(self.layers) == self.c.size:
-            return np.eye(self.c.size - 1)
         layers = np.array(self.by_layer.state_order[:-1], int)
         return np.asarray(layers[:, None] == self.layer_of[np.array(self.state_order[:-1], int)], float)
 

@@ -37,10 +37,7 @@ _STATEMENT = re.compile(
 
 
 def parse_deck(text: str, path: Path | None = None) -> Deck:
-    """Read a netlist, whose first line is the title.
-
-    Files are included from the folder of `path`, that of the file with this text; without it, only native libraries.
-    """
+    """Read a netlist, whose first line is the title; files are included from the folder of its `path`, if given."""
     deck = Deck(text, path)
     refuse(not text.strip("\ufeff \t\r\n"), f"'{deck.file}' is empty: a netlist begins with a title line")
     refuse(len(text) > MAX_BYTES, f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
@@ -91,7 +88,6 @@ class _Instance:
         return self.ports.get(lower) or (f"{self.prefix}{lower}".lower(), f"{self.prefix}{name}")
 
     def nodes(self, words: list[Lexeme]) -> list[tuple[str, str]]:
-        """Canonical and written names of nodes."""
         for word in words:
             if word.kind != "word":
                 raise InputError(f"{word.written} stands where a node's name belongs", word.where)
@@ -168,7 +164,16 @@ class _Instance:
             _refuse_captured(native, given, words, scope)
             self.deck.statements.append(Statement(name, native, canonical, written, (), params, lexemes[0].where))
             return
-        self._count(called, device)
+        for start, outer in enumerate(self.calls):
+            if outer is called:
+                path = " -> ".join(sub.name for sub in (*self.calls[start:], called))
+                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", device.where)
+        self.deck.expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
+        self.deck.expanded_text += called.characters
+        refuse(len(self.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", device)
+        refuse(self.deck.expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", device)
+        problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
+        refuse(self.deck.expanded_text > MAX_EXPANDED_TEXT, problem, device)
         ports = dict(zip(called.ports, self.nodes(nodes), strict=True))
         called.called = True
         # Values on the X line are evaluated in the caller's scope, defaults in the subcircuit's.
@@ -181,19 +186,6 @@ class _Instance:
             inner.preset(parameter, scope.number(value))
         _refuse_captured(called.name, inner.solve(), words, scope)
         _Instance(self.deck, called, inner, around, f"{name}.", ports, (*self.calls, called)).expand()
-
-    def _count(self, called: Subcircuit, device: Lexeme) -> None:
-        """Count what a call expands to; refuse circles, and what is too deep or too much."""
-        for start, outer in enumerate(self.calls):
-            if outer is called:
-                path = " -> ".join(sub.name for sub in (*self.calls[start:], called))
-                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", device.where)
-        self.deck.expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
-        self.deck.expanded_text += called.characters
-        refuse(len(self.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", device)
-        refuse(self.deck.expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", device)
-        problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
-        refuse(self.deck.expanded_text > MAX_EXPANDED_TEXT, problem, device)
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:

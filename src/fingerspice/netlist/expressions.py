@@ -126,7 +126,6 @@ class Expression:
         self._pieces.clear()
 
     def _take(self, *texts: str) -> _Piece | None:
-        """The next piece if it is one of these."""
         piece = self._pieces[self._at]
         if piece.text not in texts:
             return None

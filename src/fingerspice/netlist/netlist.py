@@ -295,9 +295,7 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
 
 
 def _require(condition: bool, what: str, given: Number | None, allowed: str) -> None:
-    if not condition:
-        assert given is not None
-        raise InputError(f"{what} is {given.text}; allowed: {allowed}", given.where)
+    refuse(not condition, f"{what} is {given and given.text}; allowed: {allowed}", given)
 
 
 def read_ac(directive: Directive) -> AcSweep:

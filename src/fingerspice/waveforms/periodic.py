@@ -1,7 +1,4 @@
-"""Waveforms of straight pieces: PWL, square, triangle, sawtooth, pulses; and stretches that are used once or repeated.
-
-The base class of straight pieces is `Ramps`, of which a subclass only lists its knots.
-"""
+"""Waveforms of straight pieces: PWL, square, triangle, sawtooth, pulses; and stretches used once or repeated."""
 
 from __future__ import annotations
 
@@ -359,16 +356,11 @@ class Pulse(Ramps):
 
     @cached_property
     def knots(self) -> tuple[FloatArray, FloatArray]:
-        start = 0.0 if self.period else self.delay
-        up = start + self.rise
-        if not math.isfinite(self.width):
-            return np.array([start, up]), np.array([self.v1, self.v2])
-        t = [start, up, up + self.width, up + self.width + self.fall]
-        v = [self.v1, self.v2, self.v2, self.v1]
+        t = np.cumsum([0.0 if self.period else self.delay, self.rise, self.width, self.fall])
+        v = np.array([self.v1, self.v2, self.v2, self.v1])
         if self.period and self.pulse_period > t[-1]:
-            t.append(self.pulse_period)
-            v.append(self.v1)
-        return np.array(t), np.array(v)
+            t, v = np.append(t, self.pulse_period), np.append(v, self.v1)
+        return t[np.isfinite(t)], v[np.isfinite(t)]
 
 
 _ROUNDING_OF_TIMES = 8e-16  # A time so near a breakpoint, relatively, differs from it by rounding: it is replaced.
