@@ -142,7 +142,6 @@ def keep_freed_memory() -> None:
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if "MALLOC_TRIM_THRESHOLD_" in os.environ else None
     if mallopt is not None:
-        # As in malloc.h: M_TRIM_THRESHOLD, what may be free at the top of the heap, and M_MMAP_THRESHOLD, the size
-        # below which blocks come from the heap.
+        # As in malloc.h: M_TRIM_THRESHOLD, most that is free on top of the heap; M_MMAP_THRESHOLD, its largest block.
         for parameter in (-1, -3):
             mallopt(parameter, 128 << 20)

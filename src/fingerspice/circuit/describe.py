@@ -454,10 +454,9 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
         """Of each gap (n_gap, _GRID.size), with the skin's own data at each frequency and with those held at one."""
         networks = network_of(circuit), network_of(with_skin_held(circuit))
         gaps, areas = [gap for gap in networks[0].gaps if gap is not None], networks[0].areas_at_rest
-        try:
+        with suppress(np.linalg.LinAlgError):
             return [np.abs(n.phasors(_GRID, areas, np.ones(1, complex)).T[gaps]) ** 2 for n in networks]
-        except np.linalg.LinAlgError:
-            return None
+        return None
 
     squares = shared(circuit, ("squared gains",), squared_gains)
     f, energy = _recorded(waveform, t_stop) or _energies(waveform, t_stop, SKIN_BAND[1])
@@ -496,14 +495,12 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     of phasors, plus an estimate of the error due to the change of the area, `sensitivity` relative to the area.
     """
     dispersive, frozen = build_stack(circuit), build_stack(circuit, skin_at=frequency)
-    gap = dispersive.gap_layer
-    assert gap is not None
     span = min(t_stop, _PERIODS / frequency)
     u = _samples(dispersive.waveform, 0.0, span, _enough(span, 200.0 * frequency))
     # The run is padded with zeros to twice its length, because the discrete transform is cyclic.
     lines = np.fft.rfft(u, 2 * u.size)
     f = np.arange(1, lines.size) / (2.0 * span)
-    gains = [layer_gains(stack.admittance(f, np.array([area])))[:, gap] for stack in (dispersive, frozen)]
+    gains = [layer_gains(stack.admittance(f, np.array([area])))[:, stack.gap_layer] for stack in (dispersive, frozen)]
     responses = (np.append(0.0, gain * lines[1:]) for gain in (gains[0], gains[1] - gains[0]))
     peak, missed = (float(np.abs(np.fft.irfft(one)[: u.size]).max()) for one in responses)
     return missed / peak + COUPLING * sensitivity if peak > 0.0 and math.isfinite(peak) else math.inf

@@ -59,18 +59,15 @@ class Network(Remembering):
     areas: tuple[Area, ...]
     contacts: tuple[Contact | None, ...]  # Contact of each area; None for an area without GAP
     gaps: tuple[int | None, ...]  # Index of the cell of each area's GAP
-    p: FloatArray  # p, q (n_cell, n): u = p x + q s
+    p: FloatArray  # (n_cell, n), and q (n_cell, n_s): u = p x + q s
     q: FloatArray
-    k: FloatArray  # k, b (n, n): Currents of resistors and current sources into the cuts of the live capacitors, S
+    k: FloatArray  # (n, n), and b (n, n_s): Currents of resistors and current sources into live capacitors' cuts, S
     b: FloatArray
     through: FloatArray  # (n_s, n_cell)
-    # (n_s, n + n_s): The current that each source delivers (a V out of its p node, an I out of its n node) is through @
-    # i + delivered @ (x, s), with the currents i of the cells
+    # (n_s, n + n_s): Each source delivers (a V from p, an I from n) through @ i + delivered @ (x, s), i of the cells
     delivered: FloatArray
-    # resistor_factor, resistor_factor_s (n_r, n): Factors f and f_s with k = f^T f and, in the columns of the voltage
-    # sources, b = f^T f_s; f_s is zero in the columns of the current sources
-    resistor_factor: FloatArray
-    resistor_factor_s: FloatArray
+    resistor_factor: FloatArray  # (n_r, n): Factor f with k = f^T f
+    resistor_factor_s: FloatArray  # (n_r, n_s): f_s with b = f^T f_s of the voltage sources, zero for the others
     node_names: tuple[str, ...]
     nodes: FloatArray  # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources
     # The series stack if this is its network: modes and phasors are then computed from it, to full relative precision
@@ -264,12 +261,10 @@ class Modes(NamedTuple):
 
     rates: FloatArray  # (n,): 1/s; zero for a charge that no conductance drains
     gains: FloatArray  # (n, n_s)
-    # shape, inverse (n, n): v = inverse (x + follow s)
-    shape: FloatArray
-    inverse: FloatArray
+    shape: FloatArray  # (n, n)
+    inverse: FloatArray  # (n, n): v = inverse (x + follow s)
     follow: FloatArray  # (n, n_s): A jump ds of the sources changes x by -follow ds, and v not at all
-    # (n, n_cell): Currents j (A) through the cells in addition to their linear ones contribute -take j to v'
-    take: FloatArray
+    take: FloatArray  # (n, n_cell): Currents j (A) through the cells beside their linear ones contribute -take j to v'
 
 
 def network_modes(network: Network, area: FloatArray) -> Modes:

@@ -140,8 +140,7 @@ def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
     for walk in walks:
         if next(hop for hop in walk if hop.element.device == "V").sign < 0.0:
             return walk
-    # With opposed sources, the p node of the first source may come first in both directions: the deck's first source
-    # then decides.
+    # With opposed sources, the first one's p node may come first in both directions: the deck's first source decides.
     deciding = next(e for e in branches if e.device == "V")
     return next(walk for walk in walks if any(hop.element is deciding and hop.sign < 0.0 for hop in walk))
 
@@ -289,11 +288,9 @@ class Stack(Remembering):
     layers: tuple[Element, ...]  # In loop order, from the source's positive side
     cells: tuple[int, ...]  # Number of cells of each layer, which the arrays list one after the other
     sign: FloatArray  # (n_cell,): +1 for a layer whose p node comes first along the loop, -1 for the others
-    # c, g_total, g_area (n_cell,): Capacitance per area, F/m^2; leakage conductance independent of the area, S, and
-    # per area, S/m^2
-    c: FloatArray
-    g_total: FloatArray
-    g_area: FloatArray
+    c: FloatArray  # (n_cell,): Capacitance per area, F/m^2
+    g_total: FloatArray  # (n_cell,): Leakage conductance independent of the area, S
+    g_area: FloatArray  # (n_cell,): Leakage conductance per area, S/m^2
     gap: int | None  # Index of the gap among the cells
     gap_layer: int | None  # Index of the gap among the layers
     contact: Contact | None
@@ -440,10 +437,9 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     def make() -> Stack:
         loop = loop_of(circuit)
         if loop is None:
-            raise InputError(
-                "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is "
-                "another network; allowed for any network: simulate (run), plan, phasor (ac) and export"
-            )
+            needed = "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources"
+            allowed = "for any network: simulate (run), plan, phasor (ac) and export"
+            raise InputError(f"{needed}, and the circuit is another network; allowed {allowed}")
         return replace(shared(circuit, ("stack", skin_at, circuit.work), lambda: build(*loop)), hops=loop[0])
 
     return circuit.remember(("stack", skin_at), make)

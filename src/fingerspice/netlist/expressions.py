@@ -13,6 +13,7 @@ import operator
 import re
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from functools import lru_cache, partial
 from graphlib import CycleError, TopologicalSorter
 from typing import Literal, NamedTuple, TypeAlias
@@ -441,10 +442,9 @@ class Scope:
 
 def _names_in(text: str) -> Mapping[str, int] | None:
     """The names in an expression; None if it is not arithmetic."""
-    try:
+    with suppress(Problem):
         return compiled(text).names
-    except Problem:
-        return None
+    return None
 
 
 def definitions(line: Line, start: int) -> list[Assignment]:

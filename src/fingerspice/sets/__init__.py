@@ -198,10 +198,9 @@ class ParameterSet(Shown):
             raise InputError(f"the set {name!r} has values for a {what}, which {inside} lacks; allowed: {there}")
         # A finger has one layer of each kind on its area; two would be two parts of the screen, of which one is meant.
         if len(found) > len({"" if kind == "source" else e.nodes[2] for e in found}):
-            raise InputError(
-                f"the set {name!r} has values for one {what}, and the circuit has {', '.join(e.name for e in found)}; "
-                f"allowed: one of these names (to={found[0].name!r}, or {found[0].name}={name} on the command line)"
-            )
+            both = f"the set {name!r} has values for one {what}, and the circuit has {', '.join(e.name for e in found)}"
+            way = f"to={found[0].name!r}, or {found[0].name}={name} on the command line"
+            raise InputError(f"{both}; allowed: one of these names ({way})")
         return found
 
     def to_dict(self) -> dict[str, Any]:

@@ -204,7 +204,6 @@ class Samples(Ramps):
         return peak
 
     def breakpoint_rate(self) -> float:
-        # The rate is only used to divide time into windows; so few breakpoints need none.
         return 0.0 if self.count <= FEW_KNOTS else self.count / ((self.count - 1) / self.rate)
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:

@@ -163,8 +163,7 @@ class Waveform(Remembering):
         size = np.abs(self.value(t))
         quick = self.shortest_time()
         if quick < (t1 - t0) / 4.0:
-            # A carrier is sampled too coarsely: its amplitude follows from values a quarter of a cycle apart. Look at
-            # whole cycles where that is largest.
+            # Of a carrier, look at whole cycles where its amplitude, by values a quarter of one apart, is largest.
             amplitude = np.hypot(size, self.value(np.minimum(t + 0.25 * quick, t1)))
             about = t[np.argsort(amplitude)[-8:], None] + quick * np.linspace(-0.5, 0.5, 65)
             size = np.append(size, np.abs(self.value(np.clip(about, t0, t1))))
