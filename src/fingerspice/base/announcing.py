@@ -28,8 +28,7 @@ _NOT_KEPT = f"at every run: {_NO_FOLDER}; set NUMBA_CACHE_DIR to one that can"
 class Bar:
     """A progress bar on stderr, removed when stopped; none where stderr is no terminal.
 
-    There is one bar at a time: an endless one, for an unknown amount of work, shows the time taken. It takes the place
-    of any other, which comes back when it is shown next.
+    There is one at a time. An endless one, which shows the time taken, stands for any other until that is shown next.
     """
 
     _standing: ClassVar[Bar | None] = None

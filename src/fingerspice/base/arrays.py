@@ -47,8 +47,7 @@ def read_only(x: Array) -> Array:
 def real_numbers(what: str, given: object, allowed: str) -> FloatArray:
     """Numbers that a user gives as doubles, of any shape; they may be the given array itself.
 
-    Refused are complex and masked ones, and what is no number (texts, booleans, dates, other objects, rows of unequal
-    length); for the message, `what` names the numbers and `allowed` says what they may be.
+    Complex or masked ones, booleans, other objects and uneven rows are refused: `what` they are, and what is `allowed`.
     """
     kind = f", a {type(given).__name__}"
     # Of tensors that need gradients or are on a card, NumPy makes no array.

@@ -22,8 +22,7 @@ _PIECE = 64 * 2**20
 def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
     """Call `write` with a temporary path in the same folder, then rename that file to `path`.
 
-    Where `path` is a link the file that it names is replaced; a device is written directly. Refused are folders that
-    cannot be written and full disks.
+    The file that a link names is replaced, and a device written directly. Full disks and closed folders are refused.
     """
     target = Path(os.path.realpath(path))
     temporary = target.parent / f"{UNFINISHED}{os.urandom(6).hex()}"

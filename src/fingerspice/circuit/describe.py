@@ -1,7 +1,6 @@
 """A circuit in words and its digests, checks of a call's arguments, and warnings before a run.
 
-What is said about a skin's data rests on the source's spectrum: its energy outside their band, and the error of data
-held at one frequency.
+What is said about a skin's data, outside their band or at one frequency, rests on the source's spectrum.
 """
 
 from __future__ import annotations
@@ -103,14 +102,15 @@ def _own_text(source: Element) -> str:
 
 def drive_text(circuit: Circuit) -> str:
     """Every source that is not 0 with its waveform, but for those in `changes_text`: ``V1: Sine(200 V, 100 Hz)``."""
-    replaced = {path.lower() for path in circuit.overrides} - _given_by_sets(circuit)
+    kept = {path.lower() for values, _ in in_force(circuit).values() for path in values}
+    replaced = {path.lower() for path in circuit.overrides} - kept
     on = (e for e in driving(circuit) if e.waveform not in (None, OFF) and e.name.lower() not in replaced)
     return _joined([f"{e.name}: {_own_text(e)}" for e in on])
 
 
 def changes_text(circuit: Circuit) -> str:
     """Changes since the deck was read, as ``Xgap.d = 5 um``, or by a set whose values still hold: ``set moist``."""
-    said = [f"set {name}" for name, (kept, _) in in_force(circuit).items() if kept]
+    sets = {name: kept for name, (kept, _) in in_force(circuit).items() if kept}
     now = {e.name.lower(): f"{e.name} = {_own_text(e)}" for e in circuit.elements if e.waveform is not None}
     now |= {path.lower(): f"{path} = {shown(p.value, p.unit)}" for path, p in circuit.parameters.items()}
     # A path may have been changed twice, in two spellings; of one that is unknown the last text counts.
@@ -120,13 +120,8 @@ def changes_text(circuit: Circuit) -> str:
         kind = text.partition("(")[0]
         short = text if len(text) <= 40 else f"{kind}(...)" if kind.isidentifier() else f"{text[:36]} ..."
         now[key] = f"{path} = {short}"
-    given = _given_by_sets(circuit)
-    return _joined([*said, *(now[path] for path in last if path not in given)])
-
-
-def _given_by_sets(circuit: Circuit) -> set[str]:
-    """Paths of the values that sets of parameters gave and that still hold, in lower case."""
-    return {path.lower() for kept, _ in in_force(circuit).values() for path in kept}
+    given = {path.lower() for kept in sets.values() for path in kept}
+    return _joined([*(f"set {name}" for name in sets), *(now[path] for path in last if path not in given)])
 
 
 def heading(circuit: Circuit) -> str:
@@ -179,8 +174,7 @@ Parameters = Mapping[str, float]
 def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Parameters | None = None) -> Circuit:
     """The circuit with the sources and parameters given in a call, with warnings about sources that stay on.
 
-    For a circuit with one source, its waveform, constant or function alone is enough; `parameters` is as in
-    `Circuit.replace`.
+    Of one source the waveform, constant or function alone is enough; `parameters` is as in `Circuit.replace`.
     """
     require_circuit(circuit)
     if parameters:

@@ -2,8 +2,7 @@
 
 A parameter has its unit, its default, and its legal and usual range; a value outside the usual one is warned about. The
 reader, runs, phasors and the export use the entry alone. For ngspice a layer also needs a subcircuit of the same name,
-nodes, parameters and defaults in `fingerspice.lib` and `fingerspice_mobile.lib`; `tests/test_devices.py` compares the
-entry with the subcircuits.
+nodes, parameters and defaults in both libraries in `circuits`, as `tests/test_devices.py` checks.
 """
 
 from __future__ import annotations

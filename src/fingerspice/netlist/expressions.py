@@ -1,9 +1,8 @@
 """Values of a netlist's words: numbers, keywords, and arithmetic such as `{2*d + 1u}` of parameters.
 
 From loose to tight an expression has `a ? b : c`, `||`, `&&`, comparisons, `+ -`, `* /`, signs, and `^` or `**`.
-Functions have the same meaning as in ngspice's `.param`; `log` is the natural logarithm. An expression that ngspice and
-mathematics read differently (`2^3^2`, a negative base) is refused. ngspice 39 does not know `pi`, `e`, `atan2` and
-`hypot`.
+Functions are those of ngspice's `.param`, with `log` the natural logarithm, and `pi`, `e`, `atan2` and `hypot`, which
+ngspice 39 lacks. An expression that ngspice and mathematics read differently (`2^3^2`, a negative base) is refused.
 """
 
 from __future__ import annotations

@@ -56,8 +56,7 @@ def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]
 class Ramps(Waveform):
     """Straight lines between knots (t, v), constant outside them or repeated; two knots at one time are a jump.
 
-    Subclasses have `knots`. The knots of a periodic one from the time `_first` on span one period and are repeated for
-    ever; earlier knots occur once.
+    Of a periodic subclass the `knots` from the time `_first` on span one period and are repeated; earlier ones are not.
     """
 
     _first: float = 0.0  # Time (s) from which the waveform is periodic
