@@ -13,8 +13,7 @@ from typing import Any
 
 from fingerspice.base.errors import InputError
 
-#: The beginning of temporary names.
-UNFINISHED = ".fingerspice-"
+UNFINISHED = ".fingerspice-"  #: The beginning of temporary names.
 _UNFINISHED: set[Path] = set()
 _PIECE = 64 * 2**20
 

@@ -116,7 +116,8 @@ class Circuit(Remembering, Shown):
 
     Attributes
     ----------
-    title : str
+    title, text : str
+        Title and text of the deck.
     elements : tuple of Element
     tran : Tran or None
     ac : AcSweep or None
@@ -131,8 +132,6 @@ class Circuit(Remembering, Shown):
         Warnings of the reader and of `replace`.
     unused : tuple of str
         Directives that are accepted and have no effect here.
-    text : str
-        Text of the deck.
     path : Path or None
     overrides : mapping of str to str
         Changes made by `replace`, from path to value as text.

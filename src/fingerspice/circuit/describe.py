@@ -237,8 +237,7 @@ _window = lru_cache(maxsize=8)(np.hanning)
 # Least length (s) of a piece of a recording, two periods of the lowest frequency of the skin's data; and the number of
 # samples up to which straight lines between them are looked at instead.
 _LEAST, _FEW = 2.0 / SKIN_BAND[0], 4096
-# A source is in a band if no more than this fraction of its energy is outside.
-NOTABLE = 0.01
+NOTABLE = 0.01  # A source is in a band if no more than this fraction of its energy is outside.
 # The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
 # relative error of at most COUPLING times the relative change of the area; 0.004 was found for a change of a quarter.
 COUPLING = 0.05

@@ -169,8 +169,7 @@ def _device(name: str, parameters: Iterable[dict[str, Any]] = (), **given: Any) 
     return DeviceSpec(name, parameters=specs, cells=_CELLS.get(name), **words)
 
 
-#: Every device that the reader knows, by name.
-DEVICES = {one["name"]: _device(**one) for one in _DATA["device"]}
+DEVICES = {one["name"]: _device(**one) for one in _DATA["device"]}  #: Every device that the reader knows, by name.
 
 
 def layer_devices() -> tuple[str, ...]:

@@ -32,8 +32,7 @@ from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
 from fingerspice.waveforms.waveform import Sum, Waveform, refuse, require
 
-# A current of a source that is this small, relative to what it is the difference of, is rounding.
-_ROUNDING = 1e-13
+_ROUNDING = 1e-13  # A current of a source that is this small, relative to what it is the difference of, is rounding.
 
 
 class Cell(NamedTuple):

@@ -31,10 +31,8 @@ from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, SKIN_LADDER, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, refuse
 
-#: Largest number of elements of a circuit, because every matrix of a network is dense.
-MAX_ELEMENTS = 2000
-#: Number of slabs of a dispersive skin.
-SLABS = len(SKIN_LADDER.poles) + 1
+MAX_ELEMENTS = 2000  #: Largest number of elements of a circuit, because every matrix of a network is dense.
+SLABS = len(SKIN_LADDER.poles) + 1  #: Number of slabs of a dispersive skin.
 _GROUNDS = ("gnd", "ground", "earth", "vss")
 
 
@@ -65,8 +63,7 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
         allowed = "a V element that drives the stack, such as V1 drive 0 SIN(0 200 100), or a start, IC= of a capacitor"
         still = not circuit.initial and all(e.initial is None for e in branches)
         refuse(still, f"the circuit has no source; allowed: {allowed} or .ic v(node)=")
-        # In place of a source, one of 0 A.
-        nodes, names = branches[0].nodes[1::-1], branches[0].node_names[1::-1]
+        nodes, names = branches[0].nodes[1::-1], branches[0].node_names[1::-1]  # In place of a source, one of 0 A.
         branches.append(Element("none", "I", nodes, names, MappingProxyType({}), OFF))
     _refuse_unsolvable(branches)
     return areas, branches

@@ -404,8 +404,7 @@ class Scope:
         if lexeme.kind == "expression" or (bare == "arithmetic" and plain):
             return self.number(lexeme)
         if bare != "nothing" and not known and signs and not plain:
-            # Arithmetic of numbers and known parameters only
-            names = _names_in(text)
+            names = _names_in(text)  # Arithmetic of numbers and known parameters only
             if names is not None and all(name in self._visible or name in CONSTANTS for name in names):
                 refuse(bare == "name", f"arithmetic goes in braces: {{{text}}}", where)
                 known = True

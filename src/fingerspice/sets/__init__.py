@@ -24,13 +24,11 @@ from fingerspice.waveforms.waveform import AM, Sine, Waveform, require
 
 #: Waveforms of drives, by the name that a set gives.
 WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}
-#: Units that take a prefix in tables.
-_PREFIXED = ("m", "ohm", "V", "Hz", "N")
+_PREFIXED = ("m", "ohm", "V", "Hz", "N")  #: Units that take a prefix in tables.
 DATA = Path(__file__).with_name("data")
 #: Where a work is found, by BibTeX's names, with the words before them in a sentence.
 _SAID = (("journal", ""), ("booktitle", ""), ("volume", "vol."), ("number", "no."), ("pages", "pp."), ("note", ""))
-#: Kinds of sets, in the order in which they are listed.
-KINDS = ("scene", "finger", "load", "coating", "drive")
+KINDS = ("scene", "finger", "load", "coating", "drive")  #: Kinds of sets, in the order in which they are listed.
 #: Elements of a value, with the devices to which it is given; a source is a V element that drives.
 ELEMENTS = {"gap": ("GAP",), "skin": ("SKIN", "SKIN_DISPERSIVE"), "coating": ("LAYER",), "source": ("V",)}
 
@@ -294,8 +292,7 @@ def quantity(value: float, unit: str) -> str:
     return format_si(value, unit) if unit in _PREFIXED else f"{value:g} {unit}".rstrip()
 
 
-#: The paper whose model is simulated.
-_MODEL = "Forsbach2021"
+_MODEL = "Forsbach2021"  #: The paper whose model is simulated.
 #: Programs that integrated the run, by the part of the method's name before the colon.
 _METHODS = {"scipy": "SciPy", "torchdiffeq": "torchdiffeq"}
 

@@ -150,8 +150,7 @@ def same_time(t: float) -> float:
 def on_grid(t: FloatArray, start: float, step: float, slack: float) -> bool:
     """Whether the times `t` (s) are start, start + step, ..., each to within `slack` (s)."""
     for first in range(0, t.size, _AT_ONCE):
-        # Counted, not compared one by one: only so the compiler makes vector instructions of it.
-        missed = 0
+        missed = 0  # Counted, not compared one by one: only so the compiler makes vector instructions of it.
         for i in range(first, min(first + _AT_ONCE, t.size)):
             missed += not abs(t[i] - (start + i * step)) <= slack
         if missed > 0:
