@@ -69,8 +69,7 @@ def paced(what: str, first: float = 0.0) -> Iterator[Callable[..., None]]:
     """A bar for work of which a share is done at first, shown after one second; gives what sets the share of now."""
     bar, begun = Bar(what), time.perf_counter()
 
-    # `pace` says the pace by the seconds taken.
-    def show(done: float, pace: Callable[[float], str] = lambda _: "") -> None:
+    def show(done: float, pace: Callable[[float], str] = lambda _: "") -> None:  # `pace` words the pace by seconds.
         took = time.perf_counter() - begun
         if took > 1.0 and done > first and sys.stderr.isatty():
             minutes, seconds = divmod(int((1.0 - done) * took / (done - first)), 60)

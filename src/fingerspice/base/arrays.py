@@ -50,8 +50,7 @@ def real_numbers(what: str, given: object, allowed: str) -> FloatArray:
     Complex or masked ones, booleans, other objects and uneven rows are refused: `what` they are, and what is `allowed`.
     """
     kind = f", a {type(given).__name__}"
-    # Of tensors that need gradients or are on a card, NumPy makes no array.
-    with suppress(TypeError, ValueError, RuntimeError):
+    with suppress(TypeError, ValueError, RuntimeError):  # NumPy makes no array of tensors with gradients or on a card.
         array = np.asarray(given)
         if np.ma.is_masked(given):
             kind += " with masked values"

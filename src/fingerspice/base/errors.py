@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: Characters of a message; the middle of a longer one, which contains a long text of the user, is left out.
-LONGEST_MESSAGE = 1000
+LONGEST_MESSAGE = 1000  #: Characters of a message; the middle of a longer one, a text of the user, is left out.
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
         if path.exists() and not path.is_file():
             write(path)
             return path
-        # Entered before the file exists, so that `discard_unfinished` finds it whenever a signal comes.
-        _UNFINISHED.add(temporary)
+        _UNFINISHED.add(temporary)  # Before it exists: `discard_unfinished` finds it whenever a signal comes.
         hint = "; allowed: a folder that can be written"
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch(exist_ok=False)
@@ -91,8 +90,7 @@ def discard_unfinished() -> None:
 
 
 def _discard(temporary: Path) -> None:
-    # Where the folder is gone, or is none, there is nothing to remove.
-    with suppress(OSError):
+    with suppress(OSError):  # Where the folder is gone, or is none, there is nothing to remove.
         temporary.unlink(missing_ok=True)
     _UNFINISHED.discard(temporary)
 

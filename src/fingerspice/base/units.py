@@ -74,8 +74,7 @@ def format_si(value: float, unit: str, digits: int = 4) -> str:
     """A value in engineering notation, without trailing zeros: ``format_si(3.5e-6, "m")`` gives ``3.5 um``."""
     if not math.isfinite(value) or value == 0.0:
         return f"{value + 0.0:g} {unit}".rstrip()
-    # Rounded first, as 999.96 to four digits is 1 k and not 1000.
-    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")  # 999.96 to four digits is 1 k.
     power = 3 * (int(exponent) // 3)
     if power not in _PREFIXES:
         return f"{value:.{digits}g} {unit}".rstrip()

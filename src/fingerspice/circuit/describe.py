@@ -165,8 +165,7 @@ def _joined(said: list[str]) -> str:
     return ", ".join([*said[:_MOST], *([f"and {len(said) - _MOST} more"] if len(said) > _MOST else [])])
 
 
-#: A waveform, a constant (V, or A of a current source), or a function of time (s).
-Source = Waveform | float | Callable[[float], float]
+Source = Waveform | float | Callable[[float], float]  #: A waveform, a constant (V or A), or a function of time (s).
 Sources = Mapping[str, Source] | Source
 Parameters = Mapping[str, float]
 
@@ -264,7 +263,6 @@ def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) 
     """
     for name, wave in ((e.name, e.waveform) for e in driving(circuit) if e.waveform is not None):
         (first, last), recording = wave.course, as_samples(wave)
-        # Of a recording or table; 0 of other waveforms.
         table = len(wave.times) if isinstance(wave, PWL) and wave.repeat is None else 0
         count = table if recording is None else recording.count
         if (count > 1 and last < start == 0.0) or stop <= first < math.inf:
@@ -301,8 +299,7 @@ def scenes_warnings(
     """
     for path, values in scenes.items():
         for end in sorted({values.min(), values.max()}):
-            # A scene that cannot be run says so itself.
-            with suppress(InputError):
+            with suppress(InputError):  # A scene that cannot be run says so itself.
                 yield from unusual_of_changed(circuit, circuit.varied({path: float(end)}))[1]
     stop = t_stop or (math.nan if circuit.tran is None else circuit.tran.stop)
     if not any(path.startswith(f"{e.name}.") for e in driving(circuit) for path in scenes):
@@ -457,8 +454,7 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
         return None
 
     def at_lines() -> list[list[FloatArray]]:
-        # Interpolated in log f; beyond the ends of the grid they are those of the ends.
-        place = np.log(np.maximum(f, SKIN_BAND[0]))
+        place = np.log(np.maximum(f, SKIN_BAND[0]))  # In log f; beyond the ends of the grid they are those of the ends.
         return [[np.interp(place, np.log(_GRID), row) for row in square] for square in squares]
 
     gains = shared(circuit, ("gains at", f.size, f[-1]), at_lines)
@@ -490,8 +486,7 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     dispersive, frozen = build_stack(circuit), build_stack(circuit, skin_at=frequency)
     span = min(t_stop, _PERIODS / frequency)
     u = _samples(dispersive.waveform, 0.0, span, _enough(span, 200.0 * frequency))
-    # The run is padded with zeros to twice its length, because the discrete transform is cyclic.
-    lines = np.fft.rfft(u, 2 * u.size)
+    lines = np.fft.rfft(u, 2 * u.size)  # Padded with zeros to twice its length, as the transform is cyclic.
     f = np.arange(1, lines.size) / (2.0 * span)
     gains = [layer_gains(stack.admittance(f, np.array([area])))[:, stack.gap_layer] for stack in (dispersive, frozen)]
     responses = (np.append(0.0, gain * lines[1:]) for gain in (gains[0], gains[1] - gains[0]))

@@ -63,8 +63,7 @@ class Network(Remembering):
     k: FloatArray  # (n, n), and b (n, n_s): Currents of resistors and current sources into live capacitors' cuts, S
     b: FloatArray
     through: FloatArray  # (n_s, n_cell)
-    # (n_s, n + n_s): Each source delivers (a V from p, an I from n) through @ i + delivered @ (x, s), i of the cells
-    delivered: FloatArray
+    delivered: FloatArray  # (n_s, n + n_s): A V delivers from p, an I from n: through @ i + delivered @ (x, s)
     resistor_factor: FloatArray  # (n_r, n): Factor f with k = f^T f
     resistor_factor_s: FloatArray  # (n_r, n_s): f_s with b = f^T f_s of the voltage sources, zero for the others
     node_names: tuple[str, ...]
@@ -280,8 +279,7 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
     left, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T)
     rates, pushed = np.zeros(n), np.zeros((n, n_s))
     rates[: sigma.size] = sigma**2
-    # The computed rate of a charge that no conductance drains is round-off.
-    rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0
+    rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0  # The rate of a charge that no conductance drains is round-off.
     take = turned @ np.linalg.solve(lower, network.p.T)
     moved, shape = take @ (capacitance * network.q), np.linalg.solve(lower.T, turned.T)
     pushed[: sigma.size] = sigma[:, None] * (left[:, : sigma.size].T @ factor_s)
@@ -311,8 +309,7 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
 def checked(circuit: Circuit) -> Circuit:
     """The circuit, refused if a value is not allowed or it has no solution."""
     check(circuit)
-    # Of a stack the network follows from its cells, and cannot fail.
-    (build_stack if statespace.loop_of(circuit) else network_of)(circuit)
+    (build_stack if statespace.loop_of(circuit) else network_of)(circuit)  # That of a stack follows from its cells.
     return circuit
 
 

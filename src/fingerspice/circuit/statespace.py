@@ -259,8 +259,7 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
     voltages = [e for e in branches if e.device == "V"]
     taken, _ = spanning_tree(e.nodes for e in voltages)
     if not all(taken):
-        # The sources before form no loop: there is one way through them from one end to the other.
-        e = voltages[taken.index(False)]
+        e = voltages[taken.index(False)]  # There is one way through those before, from one end to the other.
         came, names, node = _ways(voltages[: taken.index(False)], e.nodes[0]), list[str](), e.nodes[1]
         while (step := came[node]) is not None:
             names.append(step.name)
@@ -395,8 +394,7 @@ def contact_of(gap: Element) -> Contact:
 
     def make() -> Contact:
         v = gap.values
-        # A product may overflow, or a logarithm be taken of one that underflows.
-        with suppress(ArithmeticError, ValueError):
+        with suppress(ArithmeticError, ValueError):  # A product may overflow, or underflow before its logarithm.
             alpha, beta, c2 = v["alpha"] * 1e-6, v["beta"] * 1e-6 * 1e3 ** v["n_exp"], v["c2"] * 1e-12
             contact = Contact(v["d"], v["eps_r"], v["fn"], v["mu"], alpha, v["m_exp"], beta, v["n_exp"], c2)
             if np.all(np.isfinite(contact.packed)):

@@ -28,8 +28,7 @@ MAX_DEPTH = 32
 
 _TITLE = re.compile(r"^\.title\s+", re.IGNORECASE)
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
-#: Titles that are probably the netlist's first statement.
-_STATEMENT = re.compile(
+_STATEMENT = re.compile(  #: Titles that are probably the netlist's first statement.
     rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}|x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)"
     rf"|(?:{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
     re.IGNORECASE,

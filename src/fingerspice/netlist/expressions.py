@@ -54,8 +54,7 @@ def _pwr(base: float, exponent: float) -> float:
 
 
 _AS_IN_MATH = "sqrt exp log10 sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh floor ceil"
-#: From a name to the function, and its number of arguments.
-FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {
+FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {  #: By name the function, and its number of arguments.
     **{name: (getattr(math, name), 1) for name in _AS_IN_MATH.split()},
     "ln": (math.log, 1), "log": (math.log, 1), "arctan": (math.atan, 1), "abs": (abs, 1), "sqr": (lambda x: x * x, 1),
     "sgn": (lambda x: (x > 0.0) - (x < 0.0), 1), "int": (math.trunc, 1), "nint": (round, 1), "min": (min, 2),
@@ -372,8 +371,7 @@ class Scope:
             for name in filter(texts.__contains__, TopologicalSorter(graph).static_order()):
                 self.preset(name, self.number(texts[name]))
         except CycleError as error:
-            # From a parameter to those in its definition, which graphlib gives backwards.
-            circle = error.args[1][:0:-1]
+            circle = error.args[1][:0:-1]  # From a parameter to those in its definition: graphlib goes backwards.
             path = [circle[-1], *circle]
             shown = [self._definitions[name].key.text for name in path]
             if len(shown) > 12:

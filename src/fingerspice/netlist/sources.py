@@ -234,8 +234,7 @@ def _words(statement: Statement) -> list[Word]:
     name, body, params = statement.name, list(statement.body), statement.params
     last = body[-1] if body else None
     if "wavefile" in params and not any(isinstance(word, Call) for word in body):
-        # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, and the first channel if none is chosen.
-        path = params["wavefile"]
+        path = params["wavefile"]  # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, first channel by default.
         where = path.key or path.where
         for key, value in params.items():
             if key not in ("wavefile", "chan"):

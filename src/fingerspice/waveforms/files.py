@@ -232,10 +232,8 @@ _TIME_NAMES = ("t", "time")
 # Sizes that stand for an unknown one in a live stream's header, the second by SoX: samples go on to the file's end.
 _UNKNOWN_SIZES = (0xFFFFFFFF, 0x7FFFF000)
 _MOST_CHUNKS = 10_000  # Most chunks of a file that are looked at, so that a crafted one takes no minutes.
-# Names of number formats that are not read.
-_FORMATS = {2: "ADPCM", 6: "ALAW", 7: "MULAW", 17: "DVI_ADPCM", 85: "MPEGLAYER3"}
-# First bytes of other file formats, to name the format in the message.
-_OTHERS = {
+_FORMATS = {2: "ADPCM", 6: "ALAW", 7: "MULAW", 17: "DVI_ADPCM", 85: "MPEGLAYER3"}  # Number formats that are not read.
+_OTHERS = {  # First bytes of other file formats, to name the format in the message.
     b"ID3": "MP3", b"\xff\xfb": "MP3", b"\xff\xf3": "MP3", b"OggS": "Ogg", b"fLaC": "FLAC", b"FORM": "AIFF",
     b"caff": "CAF", b"PK": "ZIP or NPZ",
 }  # fmt: skip

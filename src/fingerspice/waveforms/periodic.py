@@ -107,24 +107,21 @@ class Ramps(Waveform):
         times, values = self.knots
         if self.period is not None:
             edges = self._edges(flat.min(), flat.max())
-            # Any time before the first edge, for what comes before it, and any time behind the last one.
-            far = 1.0 + 2.0 * np.abs(edges[[0, -1]])
+            far = 1.0 + 2.0 * np.abs(edges[[0, -1]])  # Times before the first edge and behind the last one.
             bounds = np.concatenate([-far[:1], edges, far[1:]])
             index = edges.searchsorted(flat, "right" if side == "right" else "left")
             v0, slope = self._line(bounds[index], bounds[index + 1])
             return np.asarray(v0 + slope * (flat - bounds[index]))
         out = np.interp(flat, times, values)
         if side == "left":
-            # At a knot its own value, and at a jump that of the first of two knots.
-            j = np.minimum(times.searchsorted(flat), times.size - 1)
+            j = np.minimum(times.searchsorted(flat), times.size - 1)  # At a knot its own value, the first at a jump.
             out = np.where(times[j] == flat, values[j], out)
         return out
 
     def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Values (V) at `start` and slopes (V/s) of the straight pieces between `start` and `stop` (s)."""
-        # A piece is identified by its midpoint, which rounding cannot move into a neighbour.
         times, values = self.knots
-        middle = 0.5 * (start + stop)
+        middle = 0.5 * (start + stop)  # It identifies a piece: rounding cannot move it into a neighbour.
         run = np.zeros(1)
         if self.period is not None:
             run = self._origin + np.maximum(np.floor((middle - self._first) / self.period), 0.0) * self.period
