@@ -42,8 +42,7 @@ class InputError(FingerspiceError, ValueError):
 
 def printable(text: str, longest: int = LONGEST_MESSAGE) -> str:
     """One line that is safe to show: control characters are escaped, and the middle of a long text is left out."""
-    # Shortened before escaping, which then has little to do, and after it, since it lengthens the text.
-    text = _shortened(text, longest)
+    text = _shortened(text, longest)  # Before escaping, to leave it little, and after it, since it lengthens the text.
     if text.isprintable():
         return text
     return _shortened("".join(c if c.isprintable() else repr(c)[1:-1] for c in text), longest)

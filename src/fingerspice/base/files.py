@@ -114,8 +114,7 @@ def mend_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            # Opens the lowest free number, which is this one; else the first file opened would become this stream.
-            os.open(os.devnull, os.O_RDWR)
+            os.open(os.devnull, os.O_RDWR)  # It gets the lowest free number, this one; else the next file would.
     for number, name in ((1, "stdout"), (2, "stderr")):
         raw, encoding = _Raw(number, "w", closefd=False), getattr(getattr(sys, name), "encoding", None) or "utf-8"
         buffer, lines = io.BufferedWriter(raw), raw.isatty() or number == 2

@@ -63,8 +63,7 @@ def digests(circuit: Circuit) -> tuple[str, str]:
     return elements.hexdigest(), sources.hexdigest()
 
 
-# Largest number of changes, or of sources, that one line names, and of elements that a circuit's page lists.
-_MOST, _MOST_ELEMENTS = 8, 25
+_MOST, _MOST_ELEMENTS = 8, 25  # Most changes or sources that a line names, and most elements that a page lists.
 
 
 def meaning_of(circuit: Circuit, path: str) -> str:
@@ -219,22 +218,17 @@ def area_given(area: Any) -> str | float:
     return number
 
 
-# Largest relative difference of frequencies that are the same, and smallest one of the mean force that is given as a
-# number; and the words by which a warning about a SKIN begins.
+# Largest relative difference of equal frequencies, smallest told one of a mean force, words of warnings about a SKIN.
 _SAME, _LITTLE, _TAKES = 1e-9, 0.005, "takes its data at f ="
-# Smallest number of points that make a PWL a recording, which is meant to be run to its end and not to be a step in a
-# longer run; and the smallest fraction of a run that a recording fills without a warning.
+# Fewest points of a PWL that is meant as a recording, and smallest fraction of a run that one fills without a warning.
 _RECORDED, _FILLED = 100, 0.01
-# Times (s) from `_CLOCK` on are those of a clock (this is a day in 1973, counted from 1970); times beyond the end of a
-# run by a factor of `_OTHER_UNIT` or more are probably in another unit.
+# Times (s) from `_CLOCK` (in 1973) on are a clock's; those `_OTHER_UNIT` times a run's end or more in another unit.
 _CLOCK, _OTHER_UNIT = 1e8, 20.0
-# Largest number of samples of a spectrum; and of periods over which a skin's data at one frequency are judged.
-_MOST_SAMPLES, _PERIODS = 2**17, 16
+_MOST_SAMPLES, _PERIODS = 2**17, 16  # Most samples of a spectrum; periods over which data at one frequency are judged.
 # Number of pieces that represent a long run of a source without period; frequencies of gains, Hz; and Hann's windows.
 _PIECES, _GRID = 4, np.geomspace(*SKIN_BAND, 49)
 _window = lru_cache(maxsize=8)(np.hanning)
-# Least length (s) of a piece of a recording, two periods of the lowest frequency of the skin's data; and the number of
-# samples up to which straight lines between them are looked at instead.
+# Least length (s) of a recording's pieces, two periods of the lowest data; fewer samples are taken as straight lines.
 _LEAST, _FEW = 2.0 / SKIN_BAND[0], 4096
 NOTABLE = 0.01  # A source is in a band if no more than this fraction of its energy is outside.
 # The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
@@ -328,8 +322,7 @@ def scenes_warnings(
 def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
     skins = circuit.by_device("SKIN")
     waves = network_of(circuit).waveforms if skins else ()
-    # With several sources only the user can know at which frequency the skin data should be taken.
-    for skin in skins if len(waves) == 1 else ():
+    for skin in skins if len(waves) == 1 else ():  # Of several sources only the user knows which frequency to take.
         (wave,), fundamental, known = waves, waves[0].fundamental, 0.0 < stop < math.inf
         f = skin.values["f"]
         taken = f"{skin.name} {_TAKES} {f:g} Hz"

@@ -80,8 +80,7 @@ class ParameterSpec:
     first: bool = False  # Whether the explorer's page shows it at once: the paper varies it, or Table 1 gives it
     may_be_zero: bool = False
     may_be_infinite: bool = False
-    # Range of all other numbers: wide enough for any device, and so narrow that products and quotients do not overflow
-    least: float = 1e-30
+    least: float = 1e-30  # Range of other numbers: of any device, and no product or quotient overflows
     most: float = 1e30
     slider: float | None = None  # Upper end of the slider of a value that is 0 in the deck
 

@@ -68,10 +68,8 @@ class Network(Remembering):
     resistor_factor_s: FloatArray  # (n_r, n_s): f_s with b = f^T f_s of the voltage sources, zero for the others
     node_names: tuple[str, ...]
     nodes: FloatArray  # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources
-    # The series stack if this is its network: modes and phasors are then computed from it, to full relative precision
-    stack: Stack | None = None
-    # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
-    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+    stack: Stack | None = None  # Of a series loop: modes and phasors come from it, to full relative precision
+    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)  # Shared by those of other sources
 
     @property
     def drives(self) -> tuple[tuple[Element, float], ...]:
@@ -199,8 +197,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     assert all(taken[:n_v])
     live = [i for i in range(n_c) if taken[n_v + i]]
     n, n_e = len(live), len(live) + n_v
-    # The tree's branches are voltage sources, capacitors and resistors: their voltages are s, x and r.
-    order = [*range(n_v, n_e), *range(n_v)]
+    order = [*range(n_v, n_e), *range(n_v)]  # The tree's voltages are s, x and r, of sources, capacitors and resistors.
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
         """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""

@@ -292,8 +292,7 @@ class Stack(Remembering):
     contact: Contact | None
     area_given: float | None  # Area fixed by the deck, m^2
     hops: tuple[Hop, ...]  # The elements of the loop in order, from ground to ground
-    # Whatever else is computed from the layers alone, shared by stacks that differ in their sources only
-    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)  # Shared by those of other sources
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:

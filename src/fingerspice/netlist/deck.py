@@ -204,8 +204,7 @@ def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
     visible = [*layer_devices(), *(sub.name for subs in inner for sub in subs.values())]
     known = {name.lower() for name in visible}
     for word in words[2:-1]:
-        # A device's name after two words or more is probably the device, and the words after it lack their `key=`.
-        if word.text.lower() in known:
+        if word.text.lower() in known:  # Probably the device, and the words after it lack their `key=`.
             return f"{last.written} follows the device {word.text}: its parameters are written key=value"
     hint = nearest(last.text, visible) or f"; devices are {' '.join(visible[:40])}"
     return f"'{last.text}' is not a device or a .subckt{hint}"

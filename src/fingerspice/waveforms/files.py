@@ -158,8 +158,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     try:
         lines = data.decode("utf-16" if wide else "utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        # Windows' Latin-1, in which spreadsheets and LTspice write the micro sign.
-        lines = data.decode("cp1252", "replace").splitlines()
+        lines = data.decode("cp1252", "replace").splitlines()  # Latin-1 of Windows, as spreadsheets and LTspice write.
     lines = [_COMMENT.sub(r"\1", line) if ";" in line else line for line in lines]
     steps = [(number, line) for number, line in enumerate(lines, 1) if line.startswith(_STEPPED)]
     if len(steps) > 1:

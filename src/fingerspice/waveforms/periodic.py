@@ -271,8 +271,7 @@ class _Periodic(Ramps):
         return np.array(x) * self.period, self.offset + self.amplitude * np.array(y)
 
     def _times(self, t0: float, t1: float) -> FloatArray:
-        # Computed as (k + x) / f, an edge is rounded to the same double as the time that a user writes for it.
-        x = self.knots[0] * self.frequency
+        x = self.knots[0] * self.frequency  # (k + x) / f is rounded to the same double as the time that a user writes.
         runs = runs_through(1.0 / self.frequency, x.size, t0, t1, self._shift)
         return np.asarray(((runs + x) / self.frequency + self._shift).ravel())
 

@@ -18,8 +18,7 @@ from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, 
 from fingerspice.waveforms.periodic import FEW_KNOTS, PWL, Ramps
 from fingerspice.waveforms.waveform import DC, RANGES, Product, Sum, Waveform, check_range, require
 
-# Half-width of the filter in samples, beta of its Kaiser window: the gain is 1 within 0.02 % up to 0.46 of the rate.
-_WING, _BETA = 32, 8.0
+_WING, _BETA = 32, 8.0  # Filter's half-width in samples, beta of its Kaiser window: gain 1 within 0.02 % to 0.46 rate
 AT_ONCE = 1 << 20  # Number of samples of a file that are read at once.
 ON_GRID, ROUNDING = 1e-9, 1e-15  # Largest distance of a time from the grid, in spacings, and its own rounding.
 MOST_PER_POINT = 8  # Grid samples for each point of a PWL: beyond it, few long lines are faster taken one by one.

@@ -33,8 +33,7 @@ TAU = 2.0 * math.pi
 _SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.6180339887498949)[0]) / 512.0, 1.0)
 DOUBLE = 2.0**-52  #: Distance of neighbouring doubles, relative to their size.
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
-#: Most cycles of a part in a common period, and the largest relative rounding error of a ratio of two periods.
-MOST_CYCLES, _ROUNDING = 10**6, 2e-15
+MOST_CYCLES, _ROUNDING = 10**6, 2e-15  #: Most cycles in a common period, largest relative rounding of periods' ratios
 
 
 @dataclass(frozen=True)
