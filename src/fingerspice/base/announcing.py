@@ -119,4 +119,5 @@ def tell(text: str) -> None:
     if _LOG.isEnabledFor(logging.INFO) and _LOG.hasHandlers():
         _LOG.info(text)
     elif _LOG.level == logging.NOTSET and sys.stderr is not None:
-        print(f"fingerspice: note: {text}", file=sys.stderr, flush=True)
+        sys.stderr.write(f"fingerspice: note: {text}\n")
+        sys.stderr.flush()
