@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import fingerspice as fs
 from deck_edits import evaluate
 from fingerspice.base.errors import InputError, Where
-from fingerspice.base.units import format_si, parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
+from fingerspice.base.units import format_si, parse_number, suspicious_mega, unit_read_as_scale
 from ngspice_tools import call_ngspice
 from scenes import cases, listed
 
@@ -175,7 +175,7 @@ def test_what_is_no_number_or_read_differently_elsewhere_is_refused() -> None:
 def test_a_capital_m_is_suspected_of_meaning_mega_and_a_unit_that_spice_takes_for_a_scale_is_recognised() -> None:
     assert [t for t in ("1M", "0.2MOhm", "1MΩ", "-3e2M") if not suspicious_mega(t)] == []
     assert [t for t in ("1m", "0.2meg", "1MEG", "1MIL", "0.2mohm", "M", "x") if suspicious_mega(t)] == []
-    assert suggest_mega("0.2MOhm") == "0.2meg"
+    assert suspicious_mega("0.2MOhm") == "0.2meg"
     for text, unit, word, taken in (
         ("1F", "F", "farad", True), ("1farads", "F", "farad", True), ("0.5N", "N", "newton", True),
         ("1f", "F", "farad", False), ("1uF", "F", "farad", False),

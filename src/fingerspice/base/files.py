@@ -13,8 +13,7 @@ from typing import Any
 
 from fingerspice.base.errors import InputError
 
-#: The beginning of temporary names.
-UNFINISHED = ".fingerspice-"
+UNFINISHED = ".fingerspice-"  #: The beginning of temporary names.
 _UNFINISHED: set[Path] = set()
 _PIECE = 64 * 2**20
 
@@ -22,8 +21,7 @@ _PIECE = 64 * 2**20
 def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
     """Call `write` with a temporary path in the same folder, then rename that file to `path`.
 
-    Where `path` is a link the file that it names is replaced; a device is written directly. Refused are folders that
-    cannot be written and full disks.
+    The file that a link names is replaced, and a device written directly. Full disks and closed folders are refused.
     """
     target = Path(os.path.realpath(path))
     temporary = target.parent / f"{UNFINISHED}{os.urandom(6).hex()}"
@@ -32,8 +30,7 @@ def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
         if path.exists() and not path.is_file():
             write(path)
             return path
-        # Entered before the file exists, so that `discard_unfinished` finds it whenever a signal comes.
-        _UNFINISHED.add(temporary)
+        _UNFINISHED.add(temporary)  # Before it exists: `discard_unfinished` finds it whenever a signal comes.
         hint = "; allowed: a folder that can be written"
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch(exist_ok=False)
@@ -93,8 +90,7 @@ def discard_unfinished() -> None:
 
 
 def _discard(temporary: Path) -> None:
-    # Where the folder is gone, or is none, there is nothing to remove.
-    with suppress(OSError):
+    with suppress(OSError):  # Where the folder is gone, or is none, there is nothing to remove.
         temporary.unlink(missing_ok=True)
     _UNFINISHED.discard(temporary)
 
@@ -118,8 +114,7 @@ def mend_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            # Opens the lowest free number, which is this one; else the first file opened would become this stream.
-            os.open(os.devnull, os.O_RDWR)
+            os.open(os.devnull, os.O_RDWR)  # It gets the lowest free number, this one; else the next file would.
     for number, name in ((1, "stdout"), (2, "stderr")):
         raw, encoding = _Raw(number, "w", closefd=False), getattr(getattr(sys, name), "encoding", None) or "utf-8"
         buffer, lines = io.BufferedWriter(raw), raw.isatty() or number == 2

@@ -89,7 +89,6 @@ class Shown:
 
 def in_notebook() -> bool:
     """Whether this program runs in a notebook's kernel."""
-    # IPython is not a dependency: a notebook has imported it.
-    interactive = sys.modules.get("IPython")
+    interactive = sys.modules.get("IPython")  # IPython is not a dependency: a notebook has imported it.
     shell = interactive.get_ipython() if interactive is not None else None
     return shell is not None and hasattr(shell, "kernel")

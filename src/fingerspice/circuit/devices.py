@@ -2,8 +2,7 @@
 
 A parameter has its unit, its default, and its legal and usual range; a value outside the usual one is warned about. The
 reader, runs, phasors and the export use the entry alone. For ngspice a layer also needs a subcircuit of the same name,
-nodes, parameters and defaults in `fingerspice.lib` and `fingerspice_mobile.lib`; `tests/test_devices.py` compares the
-entry with the subcircuits.
+nodes, parameters and defaults in both libraries in `circuits`, as `tests/test_devices.py` checks.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.base.units import format_si, spice_text, suggest_mega, suspicious_mega, unit_read_as_scale
+from fingerspice.base.units import format_si, spice_text, suspicious_mega, unit_read_as_scale
 from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
 
 if TYPE_CHECKING:
@@ -81,8 +80,7 @@ class ParameterSpec:
     first: bool = False  # Whether the explorer's page shows it at once: the paper varies it, or Table 1 gives it
     may_be_zero: bool = False
     may_be_infinite: bool = False
-    # Range of all other numbers: wide enough for any device, and so narrow that products and quotients do not overflow
-    least: float = 1e-30
+    least: float = 1e-30  # Range of other numbers: of any device, and no product or quotient overflows
     most: float = 1e30
     slider: float | None = None  # Upper end of the slider of a value that is 0 in the deck
 
@@ -165,14 +163,12 @@ _CELLS: Mapping[str, Cells] = {
 
 
 def _device(name: str, parameters: Iterable[dict[str, Any]] = (), **given: Any) -> DeviceSpec:
-    """A device from its entry in the file."""
     specs = tuple(ParameterSpec(**{**one, "usual": _USUAL[one["usual"]]}) for one in parameters)
     words: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in given.items()}
     return DeviceSpec(name, parameters=specs, cells=_CELLS.get(name), **words)
 
 
-#: Every device that the reader knows, by name.
-DEVICES = {one["name"]: _device(**one) for one in _DATA["device"]}
+DEVICES = {one["name"]: _device(**one) for one in _DATA["device"]}  #: Every device that the reader knows, by name.
 
 
 def layer_devices() -> tuple[str, ...]:
@@ -182,18 +178,10 @@ def layer_devices() -> tuple[str, ...]:
 
 # Values
 
-# Largest plausible results, each with its unit and the reason. Air, and most solids, break down far below an electric
-# pressure of 10 MPa.
-_LARGEST = (
-    ("electroadhesive force", 100.0, "N", "as much as a finger bears"),
-    ("electric pressure", 10e6, "Pa", "that of 1.5 GV/m, beyond the strength of any layer"),
-    ("contact area", 1e-3, "m^2", "10 cm^2, more than a finger has"),
-)
-
 
 def beyond_fingers(where: str, force: float, pressure: float, area: float) -> Iterator[str]:
     """Warnings about largest values of a run (N, Pa and m^2) that no finger can have; `where` may be `` of Xgap``."""
-    for value, (what, largest, unit, reason) in zip((force, pressure, area), _LARGEST, strict=True):
+    for value, (what, largest, unit, reason) in zip((force, pressure, area), _DATA["largest"], strict=True):
         if value > largest:
             reached = f"the {what}{where} reaches {shown(value, unit)}, over {shown(largest, unit)} ({reason})"
             yield f"{reached}: some value is probably in another unit"
@@ -212,9 +200,9 @@ def unit_trap(spec: ParameterSpec, text: str) -> str | None:
 
 def mega_note(text: str, value: float, spec: ParameterSpec) -> str | None:
     """The warning about a number with a capital M, which SPICE reads as milli, if the parameter is a resistance."""
-    if spec.unit not in ("ohm", "ohm m") or not suspicious_mega(text):
+    if spec.unit not in ("ohm", "ohm m") or not (meant := suspicious_mega(text)):
         return None
-    return f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for megohm write {suggest_mega(text)}"
+    return f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for megohm write {meant}"
 
 
 def unusual(element: Element) -> Iterator[tuple[str, str]]:

@@ -31,10 +31,8 @@ from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, SKIN_LADDER, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, refuse
 
-#: Largest number of elements of a circuit, because every matrix of a network is dense.
-MAX_ELEMENTS = 2000
-#: Number of slabs of a dispersive skin.
-SLABS = len(SKIN_LADDER.poles) + 1
+MAX_ELEMENTS = 2000  #: Largest number of elements of a circuit, because every matrix of a network is dense.
+SLABS = len(SKIN_LADDER.poles) + 1  #: Number of slabs of a dispersive skin.
 _GROUNDS = ("gnd", "ground", "earth", "vss")
 
 
@@ -65,8 +63,7 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
         allowed = "a V element that drives the stack, such as V1 drive 0 SIN(0 200 100), or a start, IC= of a capacitor"
         still = not circuit.initial and all(e.initial is None for e in branches)
         refuse(still, f"the circuit has no source; allowed: {allowed} or .ic v(node)=")
-        # In place of a source, one of 0 A.
-        nodes, names = branches[0].nodes[1::-1], branches[0].node_names[1::-1]
+        nodes, names = branches[0].nodes[1::-1], branches[0].node_names[1::-1]  # In place of a source, one of 0 A.
         branches.append(Element("none", "I", nodes, names, MappingProxyType({}), OFF))
     _refuse_unsolvable(branches)
     return areas, branches
@@ -140,8 +137,7 @@ def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
     for walk in walks:
         if next(hop for hop in walk if hop.element.device == "V").sign < 0.0:
             return walk
-    # With opposed sources, the p node of the first source may come first in both directions: the deck's first source
-    # then decides.
+    # With opposed sources, the first one's p node may come first in both directions: the deck's first source decides.
     deciding = next(e for e in branches if e.device == "V")
     return next(walk for walk in walks if any(hop.element is deciding and hop.sign < 0.0 for hop in walk))
 
@@ -154,11 +150,9 @@ def count_of(circuit: Circuit) -> int:
 def _areas(circuit: Circuit) -> tuple[Area, ...]:
     layers, owners = [e for e in circuit.elements if e.spec.is_layer], dict[str, Element]()
     for gap in circuit.by_device("GAP"):
-        node = gap.nodes[2]
-        if node in owners:
-            both = f"{owners[node].name} and {gap.name} both drive the area node {gap.node_names[2]!r}"
-            raise InputError(f"{both}; allowed: one GAP per area", gap.where)
-        owners[node] = gap
+        first = owners.setdefault(gap.nodes[2], gap)
+        both = f"{first.name} and {gap.name} both drive the area node {gap.node_names[2]!r}"
+        refuse(first is not gap, f"{both}; allowed: one GAP per area", gap)
     at = _incidence(list(circuit.by_device("V", "I", "R", "C")))
     out = []
     for node, layer in {e.nodes[2]: e for e in reversed(layers)}.items():
@@ -261,13 +255,11 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
     refuse("0" not in at, "no element touches ground; allowed: one node must be 0 (or gnd)")
     reached = _ways(branches, "0")
     for node, (e, *_) in at.items():
-        if node not in reached:
-            raise InputError(f"node {named(node, e)} ({e.name}) is floating: nothing connects it to ground", e.where)
+        refuse(node not in reached, f"node {named(node, e)} ({e.name}) is floating: nothing connects it to ground", e)
     voltages = [e for e in branches if e.device == "V"]
     taken, _ = spanning_tree(e.nodes for e in voltages)
     if not all(taken):
-        # The sources before form no loop: there is one way through them from one end to the other.
-        e = voltages[taken.index(False)]
+        e = voltages[taken.index(False)]  # There is one way through those before, from one end to the other.
         came, names, node = _ways(voltages[: taken.index(False)], e.nodes[0]), list[str](), e.nodes[1]
         while (step := came[node]) is not None:
             names.append(step.name)
@@ -292,18 +284,15 @@ class Stack(Remembering):
     layers: tuple[Element, ...]  # In loop order, from the source's positive side
     cells: tuple[int, ...]  # Number of cells of each layer, which the arrays list one after the other
     sign: FloatArray  # (n_cell,): +1 for a layer whose p node comes first along the loop, -1 for the others
-    # c, g_total, g_area (n_cell,): Capacitance per area, F/m^2; leakage conductance independent of the area, S, and
-    # per area, S/m^2
-    c: FloatArray
-    g_total: FloatArray
-    g_area: FloatArray
+    c: FloatArray  # (n_cell,): Capacitance per area, F/m^2
+    g_total: FloatArray  # (n_cell,): Leakage conductance independent of the area, S
+    g_area: FloatArray  # (n_cell,): Leakage conductance per area, S/m^2
     gap: int | None  # Index of the gap among the cells
     gap_layer: int | None  # Index of the gap among the layers
     contact: Contact | None
     area_given: float | None  # Area fixed by the deck, m^2
     hops: tuple[Hop, ...]  # The elements of the loop in order, from ground to ground
-    # Whatever else is computed from the layers alone, shared by stacks that differ in their sources only
-    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)  # Shared by those of other sources
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:
@@ -358,8 +347,6 @@ class Stack(Remembering):
     @cached_property
     def grouping(self) -> FloatArray:
         """Matrix of 0 and 1 from live cells to recorded layers, shape (n_layer - 1, n_cell - 1)."""
-        if len(self.layers) == self.c.size:
-            return np.eye(self.c.size - 1)
         layers = np.array(self.by_layer.state_order[:-1], int)
         return np.asarray(layers[:, None] == self.layer_of[np.array(self.state_order[:-1], int)], float)
 
@@ -406,8 +393,7 @@ def contact_of(gap: Element) -> Contact:
 
     def make() -> Contact:
         v = gap.values
-        # A product may overflow, or a logarithm be taken of one that underflows.
-        with suppress(ArithmeticError, ValueError):
+        with suppress(ArithmeticError, ValueError):  # A product may overflow, or underflow before its logarithm.
             alpha, beta, c2 = v["alpha"] * 1e-6, v["beta"] * 1e-6 * 1e3 ** v["n_exp"], v["c2"] * 1e-12
             contact = Contact(v["d"], v["eps_r"], v["fn"], v["mu"], alpha, v["m_exp"], beta, v["n_exp"], c2)
             if np.all(np.isfinite(contact.packed)):
@@ -445,10 +431,9 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     def make() -> Stack:
         loop = loop_of(circuit)
         if loop is None:
-            raise InputError(
-                "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is "
-                "another network; allowed for any network: simulate (run), plan, phasor (ac) and export"
-            )
+            needed = "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources"
+            allowed = "for any network: simulate (run), plan, phasor (ac) and export"
+            raise InputError(f"{needed}, and the circuit is another network; allowed {allowed}")
         return replace(shared(circuit, ("stack", skin_at, circuit.work), lambda: build(*loop)), hops=loop[0])
 
     return circuit.remember(("stack", skin_at), make)

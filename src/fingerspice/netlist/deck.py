@@ -28,8 +28,7 @@ MAX_DEPTH = 32
 
 _TITLE = re.compile(r"^\.title\s+", re.IGNORECASE)
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
-#: Titles that are probably the netlist's first statement.
-_STATEMENT = re.compile(
+_STATEMENT = re.compile(  #: Titles that are probably the netlist's first statement.
     rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}|x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)"
     rf"|(?:{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
     re.IGNORECASE,
@@ -37,10 +36,7 @@ _STATEMENT = re.compile(
 
 
 def parse_deck(text: str, path: Path | None = None) -> Deck:
-    """Read a netlist, whose first line is the title.
-
-    Files are included from the folder of `path`, that of the file with this text; without it, only native libraries.
-    """
+    """Read a netlist, whose first line is the title; files are included from the folder of its `path`, if given."""
     deck = Deck(text, path)
     refuse(not text.strip("\ufeff \t\r\n"), f"'{deck.file}' is empty: a netlist begins with a title line")
     refuse(len(text) > MAX_BYTES, f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
@@ -91,7 +87,6 @@ class _Instance:
         return self.ports.get(lower) or (f"{self.prefix}{lower}".lower(), f"{self.prefix}{name}")
 
     def nodes(self, words: list[Lexeme]) -> list[tuple[str, str]]:
-        """Canonical and written names of nodes."""
         for word in words:
             if word.kind != "word":
                 raise InputError(f"{word.written} stands where a node's name belongs", word.where)
@@ -168,7 +163,16 @@ class _Instance:
             _refuse_captured(native, given, words, scope)
             self.deck.statements.append(Statement(name, native, canonical, written, (), params, lexemes[0].where))
             return
-        self._count(called, device)
+        for start, outer in enumerate(self.calls):
+            if outer is called:
+                path = " -> ".join(sub.name for sub in (*self.calls[start:], called))
+                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", device.where)
+        self.deck.expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
+        self.deck.expanded_text += called.characters
+        refuse(len(self.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", device)
+        refuse(self.deck.expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", device)
+        problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
+        refuse(self.deck.expanded_text > MAX_EXPANDED_TEXT, problem, device)
         ports = dict(zip(called.ports, self.nodes(nodes), strict=True))
         called.called = True
         # Values on the X line are evaluated in the caller's scope, defaults in the subcircuit's.
@@ -181,19 +185,6 @@ class _Instance:
             inner.preset(parameter, scope.number(value))
         _refuse_captured(called.name, inner.solve(), words, scope)
         _Instance(self.deck, called, inner, around, f"{name}.", ports, (*self.calls, called)).expand()
-
-    def _count(self, called: Subcircuit, device: Lexeme) -> None:
-        """Count what a call expands to; refuse circles, and what is too deep or too much."""
-        for start, outer in enumerate(self.calls):
-            if outer is called:
-                path = " -> ".join(sub.name for sub in (*self.calls[start:], called))
-                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", device.where)
-        self.deck.expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
-        self.deck.expanded_text += called.characters
-        refuse(len(self.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", device)
-        refuse(self.deck.expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", device)
-        problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
-        refuse(self.deck.expanded_text > MAX_EXPANDED_TEXT, problem, device)
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:
@@ -213,8 +204,7 @@ def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
     visible = [*layer_devices(), *(sub.name for subs in inner for sub in subs.values())]
     known = {name.lower() for name in visible}
     for word in words[2:-1]:
-        # A device's name after two words or more is probably the device, and the words after it lack their `key=`.
-        if word.text.lower() in known:
+        if word.text.lower() in known:  # Probably the device, and the words after it lack their `key=`.
             return f"{last.written} follows the device {word.text}: its parameters are written key=value"
     hint = nearest(last.text, visible) or f"; devices are {' '.join(visible[:40])}"
     return f"'{last.text}' is not a device or a .subckt{hint}"

@@ -1,9 +1,8 @@
 """Values of a netlist's words: numbers, keywords, and arithmetic such as `{2*d + 1u}` of parameters.
 
 From loose to tight an expression has `a ? b : c`, `||`, `&&`, comparisons, `+ -`, `* /`, signs, and `^` or `**`.
-Functions have the same meaning as in ngspice's `.param`; `log` is the natural logarithm. An expression that ngspice and
-mathematics read differently (`2^3^2`, a negative base) is refused. ngspice 39 does not know `pi`, `e`, `atan2` and
-`hypot`.
+Functions are those of ngspice's `.param`, with `log` the natural logarithm, and `pi`, `e`, `atan2` and `hypot`, which
+ngspice 39 lacks. An expression that ngspice and mathematics read differently (`2^3^2`, a negative base) is refused.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import operator
 import re
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from functools import lru_cache, partial
 from graphlib import CycleError, TopologicalSorter
 from typing import Literal, NamedTuple, TypeAlias
@@ -54,8 +54,7 @@ def _pwr(base: float, exponent: float) -> float:
 
 
 _AS_IN_MATH = "sqrt exp log10 sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh floor ceil"
-#: From a name to the function, and its number of arguments.
-FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {
+FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {  #: By name the function, and its number of arguments.
     **{name: (getattr(math, name), 1) for name in _AS_IN_MATH.split()},
     "ln": (math.log, 1), "log": (math.log, 1), "arctan": (math.atan, 1), "abs": (abs, 1), "sqr": (lambda x: x * x, 1),
     "sgn": (lambda x: (x > 0.0) - (x < 0.0), 1), "int": (math.trunc, 1), "nint": (round, 1), "min": (min, 2),
@@ -126,7 +125,6 @@ class Expression:
         self._pieces.clear()
 
     def _take(self, *texts: str) -> _Piece | None:
-        """The next piece if it is one of these."""
         piece = self._pieces[self._at]
         if piece.text not in texts:
             return None
@@ -373,8 +371,7 @@ class Scope:
             for name in filter(texts.__contains__, TopologicalSorter(graph).static_order()):
                 self.preset(name, self.number(texts[name]))
         except CycleError as error:
-            # From a parameter to those in its definition, which graphlib gives backwards.
-            circle = error.args[1][:0:-1]
+            circle = error.args[1][:0:-1]  # From a parameter to those in its definition: graphlib goes backwards.
             path = [circle[-1], *circle]
             shown = [self._definitions[name].key.text for name in path]
             if len(shown) > 12:
@@ -405,8 +402,7 @@ class Scope:
         if lexeme.kind == "expression" or (bare == "arithmetic" and plain):
             return self.number(lexeme)
         if bare != "nothing" and not known and signs and not plain:
-            # Arithmetic of numbers and known parameters only
-            names = _names_in(text)
+            names = _names_in(text)  # Arithmetic of numbers and known parameters only
             if names is not None and all(name in self._visible or name in CONSTANTS for name in names):
                 refuse(bare == "name", f"arithmetic goes in braces: {{{text}}}", where)
                 known = True
@@ -442,10 +438,9 @@ class Scope:
 
 def _names_in(text: str) -> Mapping[str, int] | None:
     """The names in an expression; None if it is not arithmetic."""
-    try:
+    with suppress(Problem):
         return compiled(text).names
-    except Problem:
-        return None
+    return None
 
 
 def definitions(line: Line, start: int) -> list[Assignment]:

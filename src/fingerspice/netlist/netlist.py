@@ -121,8 +121,7 @@ def _unusual(deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initi
 def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Waveform:
     """A waveform from netlist text such as ``SQUARE(200 100)`` or ``WAVEFILE(a.wav 150)``.
 
-    SPICE's defaults come from the circuit's .tran, and file names are relative to the working directory. Without
-    `files`, for a text from elsewhere, no file is read.
+    SPICE's defaults come from the circuit's .tran. Files, relative to the working folder, are read only with `files`.
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
@@ -295,9 +294,7 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
 
 
 def _require(condition: bool, what: str, given: Number | None, allowed: str) -> None:
-    if not condition:
-        assert given is not None
-        raise InputError(f"{what} is {given.text}; allowed: {allowed}", given.where)
+    refuse(not condition, f"{what} is {given and given.text}; allowed: {allowed}", given)
 
 
 def read_ac(directive: Directive) -> AcSweep:

@@ -1,7 +1,4 @@
-"""Files of a netlist, and its lines sorted into elements, parameters, subcircuits and directives.
-
-Files may be in the netlist's own folder; the libraries of native devices are those shipped.
-"""
+"""Files of a netlist, in its own folder, and its lines sorted into elements, parameters, subcircuits and directives."""
 
 from __future__ import annotations
 
@@ -295,7 +292,6 @@ class Deck:
             kept.append(f"{where}: {message}")
 
     def _take(self, line: Line) -> None:
-        """Enter one line in its list."""
         here, word = self._open[-1], line.text.split(None, 1)[0].lower()
         if self._control is not None:
             if word == ".endc":

@@ -48,7 +48,6 @@ class _Arguments:
         raise InputError(f"{problem}; {self.usage}", where or self.call.where)
 
     def get(self, name: str, default: float = math.nan) -> float:
-        """A number by its name."""
         return number(self.words[name], f"{self.name} {name}").value if name in self.words else default
 
     def step_or(self, name: str) -> float:
@@ -59,7 +58,6 @@ class _Arguments:
         return self.get(name, tran.step if tran else math.nan)
 
     def whole(self, name: str) -> int | None:
-        """A whole number by its name; None if it is left out."""
         if name not in self.words:
             return None
         value = number(self.words[name], name).value
@@ -67,17 +65,14 @@ class _Arguments:
         return int(value)
 
     def column(self, name: str) -> str | int | None:
-        """A column's name or number; None if it is left out."""
         word = self.words.get(name)
         return word.text if isinstance(word, Token) else self.whole(name)
 
     def upsampled(self, recording: Samples) -> Samples:
-        """The recording, upsampled by the factor that is given."""
         factor = self.whole("upsample")
         return recording if factor is None else recording.upsampled(factor)
 
     def file(self, name: str = "path") -> Path:
-        """The file that a word names."""
         if name not in self.words:
             self.refuse(f"{self.name} names no file")
         return self.context.find(self.words[name].text, self.words[name].where)
@@ -239,8 +234,7 @@ def _words(statement: Statement) -> list[Word]:
     name, body, params = statement.name, list(statement.body), statement.params
     last = body[-1] if body else None
     if "wavefile" in params and not any(isinstance(word, Call) for word in body):
-        # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, and the first channel if none is chosen.
-        path = params["wavefile"]
+        path = params["wavefile"]  # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, first channel by default.
         where = path.key or path.where
         for key, value in params.items():
             if key not in ("wavefile", "chan"):

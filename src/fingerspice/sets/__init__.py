@@ -22,15 +22,12 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import AM, Sine, Waveform, require
 
-#: Waveforms of drives, by the name that a set gives.
-WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}
-#: Units that take a prefix in tables.
-_PREFIXED = ("m", "ohm", "V", "Hz", "N")
+WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}  #: Waveforms of drives, by name.
+_PREFIXED = ("m", "ohm", "V", "Hz", "N")  #: Units that take a prefix in tables.
 DATA = Path(__file__).with_name("data")
 #: Where a work is found, by BibTeX's names, with the words before them in a sentence.
 _SAID = (("journal", ""), ("booktitle", ""), ("volume", "vol."), ("number", "no."), ("pages", "pp."), ("note", ""))
-#: Kinds of sets, in the order in which they are listed.
-KINDS = ("scene", "finger", "load", "coating", "drive")
+KINDS = ("scene", "finger", "load", "coating", "drive")  #: Kinds of sets, in the order in which they are listed.
 #: Elements of a value, with the devices to which it is given; a source is a V element that drives.
 ELEMENTS = {"gap": ("GAP",), "skin": ("SKIN", "SKIN_DISPERSIVE"), "coating": ("LAYER",), "source": ("V",)}
 
@@ -198,10 +195,9 @@ class ParameterSet(Shown):
             raise InputError(f"the set {name!r} has values for a {what}, which {inside} lacks; allowed: {there}")
         # A finger has one layer of each kind on its area; two would be two parts of the screen, of which one is meant.
         if len(found) > len({"" if kind == "source" else e.nodes[2] for e in found}):
-            raise InputError(
-                f"the set {name!r} has values for one {what}, and the circuit has {', '.join(e.name for e in found)}; "
-                f"allowed: one of these names (to={found[0].name!r}, or {found[0].name}={name} on the command line)"
-            )
+            both = f"the set {name!r} has values for one {what}, and the circuit has {', '.join(e.name for e in found)}"
+            way = f"to={found[0].name!r}, or {found[0].name}={name} on the command line"
+            raise InputError(f"{both}; allowed: one of these names ({way})")
         return found
 
     def to_dict(self) -> dict[str, Any]:
@@ -295,10 +291,8 @@ def quantity(value: float, unit: str) -> str:
     return format_si(value, unit) if unit in _PREFIXED else f"{value:g} {unit}".rstrip()
 
 
-#: The paper whose model is simulated.
-_MODEL = "Forsbach2021"
-#: Programs that integrated the run, by the part of the method's name before the colon.
-_METHODS = {"scipy": "SciPy", "torchdiffeq": "torchdiffeq"}
+_MODEL = "Forsbach2021"  #: The paper whose model is simulated.
+_METHODS = {"scipy": "SciPy", "torchdiffeq": "torchdiffeq"}  #: Programs that integrated, by the method's first part.
 
 
 @dataclass(frozen=True, repr=False)

@@ -8,6 +8,7 @@ import struct
 import zipfile
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -52,8 +53,7 @@ class Columns:
 
     def numbers(self, column: int) -> FloatArray:
         """The numbers of a column (n_row,), all finite; errors name the line."""
-        if column in self.faults:
-            raise InputError(self.faults[column])
+        refuse(column in self.faults, self.faults.get(column, ""))
         found = self.data[:, column]
         bad = np.flatnonzero(~np.isfinite(found))
         if bad.size:
@@ -73,10 +73,7 @@ class Columns:
         return f"{count} column{'s' if count > 1 else ''} {called}"
 
     def index(self, column: str | int | None, role: str, most: int, default: int) -> int:
-        """Index of a column given by its name, of which there has to be one, or by its number; else the default.
-
-        A table of more than `most` columns has no default for the role.
-        """
+        """Index of a column given by its name or number; else the default, which at most `most` columns have."""
         count = self.data.shape[1]
         if column is None:
             way = "name the column" if self.names else "the number of the column"
@@ -128,10 +125,9 @@ def read_text_columns(path: str | Path, label: str | None = None) -> Columns:
         named = [_unit(cell)[0].lower() for cell in _cells(rows[0][1], _separator(rows[0][1]))]
         refuse(label.lower() not in named, f"'{path}' has no column {label!r} in its header; it has {', '.join(named)}")
         place = named.index(label.lower())
-    first = next((i for i, (_, line) in enumerate(rows) if (i if label else _FIRST_NUMBER.match(line))), None)
-    if first is None:
-        raise InputError(f"'{path}' holds no rows of numbers")
-    begin, line = rows[first]
+    rows = rows[1:] if label else list(dropwhile(lambda row: not _FIRST_NUMBER.match(row[1]), rows))
+    refuse(not rows, f"'{path}' holds no rows of numbers")
+    begin, line = rows[0]
     _refuse_semicolons(path, begin, line)
     # In a comma-separated table the number of cells shows decimal commas.
     cells = line.split()
@@ -150,8 +146,8 @@ def read_text_columns(path: str | Path, label: str | None = None) -> Columns:
         refuse(not text.startswith(_COMMENTED), f"{problem}: is a name missing{hint}?")
         header = []
     names, units = zip(*map(_unit, header), strict=True) if header else ((), ())
-    table, faults, words = _numbers(path, rows[first:], separator, count, place)
-    return Columns(path, names, table, units, np.array([number for number, _ in rows[first:]]), faults, words)
+    table, faults, words = _numbers(path, rows, separator, count, place)
+    return Columns(path, names, table, units, np.array([number for number, _ in rows]), faults, words)
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -162,8 +158,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     try:
         lines = data.decode("utf-16" if wide else "utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        # Windows' Latin-1, in which spreadsheets and LTspice write the micro sign.
-        lines = data.decode("cp1252", "replace").splitlines()
+        lines = data.decode("cp1252", "replace").splitlines()  # Latin-1 of Windows, as spreadsheets and LTspice write.
     lines = [_COMMENT.sub(r"\1", line) if ";" in line else line for line in lines]
     steps = [(number, line) for number, line in enumerate(lines, 1) if line.startswith(_STEPPED)]
     if len(steps) > 1:
@@ -236,10 +231,8 @@ _TIME_NAMES = ("t", "time")
 # Sizes that stand for an unknown one in a live stream's header, the second by SoX: samples go on to the file's end.
 _UNKNOWN_SIZES = (0xFFFFFFFF, 0x7FFFF000)
 _MOST_CHUNKS = 10_000  # Most chunks of a file that are looked at, so that a crafted one takes no minutes.
-# Names of number formats that are not read.
-_FORMATS = {2: "ADPCM", 6: "ALAW", 7: "MULAW", 17: "DVI_ADPCM", 85: "MPEGLAYER3"}
-# First bytes of other file formats, to name the format in the message.
-_OTHERS = {
+_FORMATS = {2: "ADPCM", 6: "ALAW", 7: "MULAW", 17: "DVI_ADPCM", 85: "MPEGLAYER3"}  # Number formats that are not read.
+_OTHERS = {  # First bytes of other file formats, to name the format in the message.
     b"ID3": "MP3", b"\xff\xfb": "MP3", b"\xff\xf3": "MP3", b"OggS": "Ogg", b"fLaC": "FLAC", b"FORM": "AIFF",
     b"caff": "CAF", b"PK": "ZIP or NPZ",
 }  # fmt: skip
@@ -346,8 +339,7 @@ def _wav_chunks(path: Path, file: BinaryIO) -> tuple[str, bytes, int, int]:
     form, samples = found.get(b"fmt ", (b"", 0, 0)), found.get(b"data")
     if samples is None or len(form[0]) < 16 or form[1] > samples[1]:
         raise InputError(f"'{path}' is broken or cut short: it cannot be read as WAV to its end")
-    if samples[1] + samples[2] > size:
-        raise InputError(f"'{path}' is cut short: it ends before the samples that its header promises")
+    refuse(sum(samples[1:]) > size, f"'{path}' is cut short: it ends before the samples that its header promises")
     return order, form[0], samples[1], samples[2]
 
 
@@ -410,8 +402,7 @@ def read_table(
 def checked_file(path: str | Path, most: int) -> Path:
     """The path, after a check that it is a readable ordinary file, not empty and not larger than `most` bytes."""
     path = Path(path)
-    if fault := file_fault(path, most) or ("" if path.stat().st_size else "is empty"):
-        raise InputError(f"'{path}' {fault}")
+    refuse(fault := file_fault(path, most) or ("" if path.stat().st_size else "is empty"), f"'{path}' {fault}")
     return path
 
 

@@ -1,7 +1,4 @@
-"""Waveforms of straight pieces: PWL, square, triangle, sawtooth, pulses; and stretches that are used once or repeated.
-
-The base class of straight pieces is `Ramps`, of which a subclass only lists its knots.
-"""
+"""Waveforms of straight pieces: PWL, square, triangle, sawtooth, pulses; and stretches used once or repeated."""
 
 from __future__ import annotations
 
@@ -59,8 +56,7 @@ def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]
 class Ramps(Waveform):
     """Straight lines between knots (t, v), constant outside them or repeated; two knots at one time are a jump.
 
-    Subclasses have `knots`. The knots of a periodic one from the time `_first` on span one period and are repeated for
-    ever; earlier knots occur once.
+    Of a periodic subclass the `knots` from the time `_first` on span one period and are repeated; earlier ones are not.
     """
 
     _first: float = 0.0  # Time (s) from which the waveform is periodic
@@ -111,24 +107,21 @@ class Ramps(Waveform):
         times, values = self.knots
         if self.period is not None:
             edges = self._edges(flat.min(), flat.max())
-            # Any time before the first edge, for what comes before it, and any time behind the last one.
-            far = 1.0 + 2.0 * np.abs(edges[[0, -1]])
+            far = 1.0 + 2.0 * np.abs(edges[[0, -1]])  # Times before the first edge and behind the last one.
             bounds = np.concatenate([-far[:1], edges, far[1:]])
             index = edges.searchsorted(flat, "right" if side == "right" else "left")
             v0, slope = self._line(bounds[index], bounds[index + 1])
             return np.asarray(v0 + slope * (flat - bounds[index]))
         out = np.interp(flat, times, values)
         if side == "left":
-            # At a knot its own value, and at a jump that of the first of two knots.
-            j = np.minimum(times.searchsorted(flat), times.size - 1)
+            j = np.minimum(times.searchsorted(flat), times.size - 1)  # At a knot its own value, the first at a jump.
             out = np.where(times[j] == flat, values[j], out)
         return out
 
     def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Values (V) at `start` and slopes (V/s) of the straight pieces between `start` and `stop` (s)."""
-        # A piece is identified by its midpoint, which rounding cannot move into a neighbour.
         times, values = self.knots
-        middle = 0.5 * (start + stop)
+        middle = 0.5 * (start + stop)  # It identifies a piece: rounding cannot move it into a neighbour.
         run = np.zeros(1)
         if self.period is not None:
             run = self._origin + np.maximum(np.floor((middle - self._first) / self.period), 0.0) * self.period
@@ -278,8 +271,7 @@ class _Periodic(Ramps):
         return np.array(x) * self.period, self.offset + self.amplitude * np.array(y)
 
     def _times(self, t0: float, t1: float) -> FloatArray:
-        # Computed as (k + x) / f, an edge is rounded to the same double as the time that a user writes for it.
-        x = self.knots[0] * self.frequency
+        x = self.knots[0] * self.frequency  # (k + x) / f is rounded to the same double as the time that a user writes.
         runs = runs_through(1.0 / self.frequency, x.size, t0, t1, self._shift)
         return np.asarray(((runs + x) / self.frequency + self._shift).ravel())
 
@@ -359,16 +351,11 @@ class Pulse(Ramps):
 
     @cached_property
     def knots(self) -> tuple[FloatArray, FloatArray]:
-        start = 0.0 if self.period else self.delay
-        up = start + self.rise
-        if not math.isfinite(self.width):
-            return np.array([start, up]), np.array([self.v1, self.v2])
-        t = [start, up, up + self.width, up + self.width + self.fall]
-        v = [self.v1, self.v2, self.v2, self.v1]
+        t = np.cumsum([0.0 if self.period else self.delay, self.rise, self.width, self.fall])
+        v = np.array([self.v1, self.v2, self.v2, self.v1])
         if self.period and self.pulse_period > t[-1]:
-            t.append(self.pulse_period)
-            v.append(self.v1)
-        return np.array(t), np.array(v)
+            t, v = np.append(t, self.pulse_period), np.append(v, self.v1)
+        return t[np.isfinite(t)], v[np.isfinite(t)]
 
 
 _ROUNDING_OF_TIMES = 8e-16  # A time so near a breakpoint, relatively, differs from it by rounding: it is replaced.

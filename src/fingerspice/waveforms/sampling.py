@@ -11,6 +11,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -69,15 +70,12 @@ class Function(Waveform):
             t = np.where(np.isin(t, edges), t + aside, t)
         if t.ndim == 0:
             return np.asarray(self._scalar(np.float64(t)))
-        try:
+        with suppress(TypeError, ValueError):
             out = self._taken(self.function(t.copy()))  # A function may work in place: it gets times of its own.
             # A function written for one number may give wrong values for an array without raising: compare one value.
-            if out.shape == t.shape and (
-                t.size == 0 or np.array_equal(out.flat[t.size // 2], self._scalar(t.flat[t.size // 2]), True)
-            ):
+            one = slice(t.size // 2, t.size // 2 + 1)
+            if out.shape == t.shape and np.array_equal(out.flat[one], list(map(self._scalar, t.flat[one])), True):
                 return out
-        except (TypeError, ValueError):
-            pass
         self.kept["one by one"] = True
         return np.array([self._scalar(x) for x in t.ravel()]).reshape(t.shape)
 
@@ -152,8 +150,7 @@ def same_time(t: float) -> float:
 def on_grid(t: FloatArray, start: float, step: float, slack: float) -> bool:
     """Whether the times `t` (s) are start, start + step, ..., each to within `slack` (s)."""
     for first in range(0, t.size, _AT_ONCE):
-        # Counted, not compared one by one: only so the compiler makes vector instructions of it.
-        missed = 0
+        missed = 0  # Counted, not compared one by one: only so the compiler makes vector instructions of it.
         for i in range(first, min(first + _AT_ONCE, t.size)):
             missed += not abs(t[i] - (start + i * step)) <= slack
         if missed > 0:
@@ -195,8 +192,7 @@ def source_table(
     if terms is not None:
         if not (no_chirps and np.any(terms[:, :, 5] != 0.0)):
             return SourceTable(between, np.ascontiguousarray(terms), np.zeros((between.size - 1, 0)))
-        # The output step is not used here, so that no result depends on the outputs asked for.
-        edges, step = between, 0.1 * waveform.shortest_time()
+        edges, step = between, 0.1 * waveform.shortest_time()  # Not the outputs' step: no result depends on it.
     pieces = Refiner(waveform, tol, step, [float(t0)], shortest, scale)
     for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
@@ -217,8 +213,7 @@ _NODE_STEPS = np.diff(_PLACES[:POINTS])
 _LONGEST = 8.0
 WIDEST = 0.5 * _LONGEST * float(np.diff(np.sort(_PLACES)).max())
 
-# After `_IDLE` halvings in a row that do not reduce the misfit, a misfit below `_ROUGHEST` (relative to the largest
-# |U|, for values in doubles) is taken for round-off of the function's values.
+# After `_IDLE` halvings that do not reduce it, a misfit below `_ROUGHEST` (of the largest |U|) is taken for round-off.
 _IDLE, _ROUGHEST = 3, 1e-8
 _STEEP = 0.05  # Least change over short series, relative to the largest |U|, that is told as an edge; a kink has less.
 _NOTHING = 1e-290  # Smallest tolerance, V: below it doubles are nearly denormal, and no function appears smooth.
@@ -259,11 +254,9 @@ class Refiner:
     scale: float = 0.0  # Largest |U| (V) seen
     steepest: float = 0.0  # Largest |dU/dt| (V/s) seen
     series: list[FloatArray] = field(default_factory=list)  # (POINTS,): Chebyshev coefficients on each interval
-    # Times (s) at which neighbouring series differ, the difference (V), and whether bisection found the jump
-    jumps: list[tuple[float, float, bool]] = field(default_factory=list)
+    jumps: list[tuple[float, float, bool]] = field(default_factory=list)  # Time (s), difference (V), whether bisected
     narrow: list[float] = field(default_factory=list)  # Times (s) of intervals much shorter than the output step
-    # Start (s) of each short interval, and the change (V) over it
-    short: list[tuple[float, float]] = field(default_factory=list)
+    short: list[tuple[float, float]] = field(default_factory=list)  # Start (s) of each short interval, its change (V)
     not_finite: float | None = None  # Time (s) of the first NaN or inf
     rough: float = 0.0  # Largest misfit (V) taken for round-off of the function's values
     deep: int = 0  # Number of intervals that were halved more than `_DEEP` times
@@ -291,9 +284,7 @@ class Refiner:
                 if piece.depth > _DEEP:
                     self._refuse_noise(piece, values)
                 if idle >= _IDLE and misfit <= self._roughest:
-                    # Halving divides the misfit of a smooth function by 2^20 and the misfit at a kink by 2. A misfit
-                    # that halving does not reduce is round-off of the function's own values.
-                    self.rough = max(self.rough, misfit)
+                    self.rough = max(self.rough, misfit)  # Halving a smooth misfit divides it by 2^20, a kink's by 2.
                     series = chebyshev.coefficients(values)
             floor = max(4e-15 * max(abs(lo), abs(hi)), 1e-13 * self.step)
             if series is not None:
@@ -314,8 +305,7 @@ class Refiner:
             if piece.largest > self._roughest:
                 self.narrow.append(0.5 * (piece.lo + piece.hi))
         if self.series and not first and not (self.jumps and self.jumps[-1][0] >= piece.lo):
-            # A jump or a steep edge may lie exactly on a cut, so that the points of neither interval show it: refine
-            # both intervals until they are short.
+            # A jump or a steep edge may lie exactly on a cut, where neither interval's points show it: refine both.
             change = float(series @ _AT_START - self.series[-1].sum())
             if abs(change) > self._least and piece.hi - piece.lo > floor:
                 again = piece.halves()
@@ -392,8 +382,7 @@ class Refiner:
         known += [] if self.not_finite is None else [self.not_finite]
         apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
         if self.short:
-            # The first edge: short series whose change sums to more than `_STEEP` in a tenth of a step.
-            start, change = np.array(self.short).T
+            start, change = np.array(self.short).T  # The first edge: a sum over `_STEEP` in a tenth of a step.
             total = np.concatenate([[0.0], np.cumsum(change)])
             after = np.searchsorted(start, start + 0.1 * self.step)
             steep = np.flatnonzero(np.abs(total[after] - total[:-1]) > _STEEP * self.scale)
