@@ -464,10 +464,9 @@ def inverse_drive(
     finger = Finger(circuit, charge_law)
     wave, end = _wave_of(wanted, kind, rate, duration)
     if carrier is not None:
-        if rate is not None and rate < FEWEST * carrier:
-            allowed = f"at most a {FEWEST}th of it, {rate / FEWEST:g} Hz, or a higher rate"
-            raise InputError(f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: {allowed}")
         rate = rate or PER_PERIOD * carrier
+        fast = f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: at most a {FEWEST}th of it"
+        refuse(rate < FEWEST * carrier, f"{fast}, {rate / FEWEST:g} Hz, or a higher rate")
         refuse(end * carrier < 1.0, f"{end:g} s hold no period of the carrier; allowed: 1 or more")
     rate = rate or (wave.rate if isinstance(wave, Samples) else RATE)
     count, allowed = end * rate, f"2 to {MOST_SAMPLES:,} samples"

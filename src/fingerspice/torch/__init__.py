@@ -190,8 +190,7 @@ class Drive(torch.nn.Module):
         Returns
         -------
         tensor, or dict of str to tensor
-            Of the shape (...) of the drives, and of one more dimension, the times, for signals. A dict by name if
-            several outputs were asked for.
+            As of `Simulator.forward`; (...) is the shape of the drives.
 
         Raises
         ------

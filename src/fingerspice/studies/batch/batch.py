@@ -370,9 +370,8 @@ def _jobs(task: Task, form: LockstepForm) -> list[tuple[int, IntArray]]:
     recorded = form.recording is not None
     count = task.count(np.full(task.n, form.frequency) if recorded else task.frequencies())
     halves = np.round(2.0 * count)
-    good = (task.status < 0) & (halves >= 1.0) & (np.abs(2.0 * count - halves) <= _WHOLE * halves)
-    if any(name.endswith("_periodic") for name in task.outputs):
-        good &= halves >= 2.0
+    least = 2.0 if any(name.endswith("_periodic") for name in task.outputs) else 1.0
+    good = (task.status < 0) & (halves >= least) & (np.abs(2.0 * count - halves) <= _WHOLE * halves)
     jobs = []
     for size in np.unique(halves[good]).astype(int).tolist():
         members = np.flatnonzero(good & (halves == size))

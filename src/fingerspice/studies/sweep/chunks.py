@@ -90,10 +90,9 @@ class Work:
         ends = checked_scenes(circuit, plan.spread({name: x[[0, -1]] for name, x in plan.grid.items()}, middle))
         for text in scenes_warnings(circuit, options.get("t_stop"), ends, options.get("skin", "own")):
             warnings.warn(text, FingerspiceWarning, stacklevel=4)
-        scene = plan.spread({name: values[:1] for name, values in plan.grid.items()}, middle)
         # The warnings are those of one scene.
         with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
-            first = batch(circuit, scene, **options)
+            first = batch(circuit, {path: values[:1] for path, values in ends.items()}, **options)
         refuse("u_gap" in first, "outputs are u_gap, and a store has figures, which are one number for each scene")
         self.block: tuple[int, ...] = ()  # Scenes of a chunk along each dimension
         for length in reversed(plan.sizes):
