@@ -115,10 +115,9 @@ def _start_areas(circuit: Circuit, law: str, contacts: Mapping[str, Contact]) ->
         # Areas that follow with a delay start where the problem says.
         problem = prepare(circuit, charge_law=law, charge=False)
         net = problem.scene.net
-        slow = problem.initial.y[net.k.shape[0] :]
         for area, place, area0 in zip(problem.network.areas, net.slow, net.area0, strict=True):
             if place >= 0:
-                out[area.node] = 1e6 * float(slow[place] * area0)
+                out[area.node] = 1e6 * float(problem.initial.y[net.k.shape[0] + place] * area0)
     return out
 
 

@@ -58,13 +58,10 @@ class Finger:
         self.circuit, self.law = circuit, charge_law or circuit.charge_law or "local"
         require(self.law in CHARGE_LAWS, "charge_law", repr(self.law), " or ".join(map(repr, CHARGE_LAWS)))
         gaps, sources = circuit.by_device("GAP"), [e for e in find_branches(circuit)[1] if e.device in "VI"]
-        for what, found, device, allowed in (
-            ("one finger; this circuit has the GAPs", gaps, "GAP", "one GAP"),
-            ("one V source; this circuit has", sources, "V", "one V element"),
-        ):
-            if [e.device for e in found] != [device]:
-                names = ", ".join(e.name for e in found) or "none"
-                raise InputError(f"an inverse drive is that of {what} {names}; allowed: {allowed}")
+        one, has = "an inverse drive is that of one", [", ".join(e.name for e in x) or "none" for x in (gaps, sources)]
+        refuse(len(gaps) != 1, f"{one} finger; this circuit has the GAPs {has[0]}; allowed: one GAP")
+        other = [e.device for e in sources] != ["V"]
+        refuse(other, f"{one} V source; this circuit has {has[1]}; allowed: one V element")
         (self.gap,), (self.source,) = gaps, sources
         tau = self.gap.values["tau"]
         refuse(tau > 0.0, f"{self.gap.name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
@@ -393,8 +390,7 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Wavef
     if back.size:
         i = int(back[0])
         raise InputError(f"{found.place(i + 1)}: the time {t[i + 1]:g} s follows {t[i]:g} s; allowed: rising times")
-    t = t - t[0]
-    end = float(t[-1])
+    t, end = t - t[0], float(t[-1] - t[0])
     own = (t.size - 1) / end
     even = bool(np.all(np.abs(t * own - np.arange(t.size)) < 1e-3))
     if rate is not None and not (even and abs(rate - own) <= 1e-3 * own):
@@ -468,10 +464,9 @@ def inverse_drive(
     finger = Finger(circuit, charge_law)
     wave, end = _wave_of(wanted, kind, rate, duration)
     if carrier is not None:
-        if rate is not None and rate < FEWEST * carrier:
-            allowed = f"at most a {FEWEST}th of it, {rate / FEWEST:g} Hz, or a higher rate"
-            raise InputError(f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: {allowed}")
         rate = rate or PER_PERIOD * carrier
+        fast = f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: at most a {FEWEST}th of it"
+        refuse(rate < FEWEST * carrier, f"{fast}, {rate / FEWEST:g} Hz, or a higher rate")
         refuse(end * carrier < 1.0, f"{end:g} s hold no period of the carrier; allowed: 1 or more")
     rate = rate or (wave.rate if isinstance(wave, Samples) else RATE)
     count, allowed = end * rate, f"2 to {MOST_SAMPLES:,} samples"
@@ -558,7 +553,6 @@ class Task:
         """Of a force (N) after the lead what is compared: with a carrier, its means over the periods."""
         if self.carrier is None:
             return force
-        parts = (force[:-2:2] + 4.0 * force[1::2] + force[2::2]) / (6.0 * self.rate)
-        total = np.append(0.0, np.cumsum(parts))
+        total = np.append(0.0, np.cumsum((force[:-2:2] + 4.0 * force[1::2] + force[2::2]) / (6.0 * self.rate)))
         at_edges = np.interp(self.edges, np.arange(total.size) / self.rate, total)
         return np.asarray(np.diff(at_edges) / np.diff(self.edges))

@@ -108,8 +108,7 @@ def phasor(
         Hz, positive; the source's fundamental by default. If frequencies are given, the drive is the deck's
         ``AC magnitude [phase]``, as in ngspice; without AC, or without frequencies, it is the source's fundamental.
     sources, parameters
-        As in `simulate`.
-        Without a GAP the result has the node voltages, and every source's AC counts.
+        As in `simulate`. Without a GAP the result has the node voltages, and every source's AC counts.
     area : str or float
         ``"mean"``: the area under the mean stress at the amplitude of the source's fundamental; ``"frozen"``: the area
         at 0 V; or an area in m^2. An area that the deck fixes takes precedence over ``"mean"`` and ``"frozen"``.

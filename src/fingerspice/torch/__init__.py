@@ -125,8 +125,7 @@ class Scenes:
 def named(what: str, number: int) -> Iterator[None]:
     """Names the scene or drive in an error, and leaves out warnings about values that an optimiser has chosen."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FingerspiceWarning)
+        with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
             yield
     except (InputError, SolveError) as error:
         raise InputError(f"{what} {number}: {error}") from error
@@ -136,8 +135,7 @@ def tensor_of(path: str, one: Tensor | ArrayLike) -> Tensor:
     """A value in double precision on the processor."""
     if not isinstance(one, Tensor):
         one = torch.from_numpy(real_numbers(path, one, "a tensor or array of numbers").copy())
-    real = not one.is_complex() and one.dtype != torch.bool
-    require(real, path, f"a tensor of {one.dtype}", "real numbers")
+    require(not one.is_complex() and one.dtype != torch.bool, path, f"a tensor of {one.dtype}", "real numbers")
     return one.to("cpu", torch.float64)
 
 
@@ -192,8 +190,7 @@ class Drive(torch.nn.Module):
         Returns
         -------
         tensor, or dict of str to tensor
-            Of the shape (...) of the drives, and of one more dimension, the times, for signals. A dict by name if
-            several outputs were asked for.
+            As of `Simulator.forward`; (...) is the shape of the drives.
 
         Raises
         ------

@@ -21,7 +21,7 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.engine.lockstep.card import require_card
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
-from fingerspice.results.solution import MEANS, Solution
+from fingerspice.results.solution import MEANS
 from fingerspice.solve.simulation import RTOL_RANGE, rtol_given, simulate
 from fingerspice.studies.batch.lockstep import LOCKSTEP, Ladder, LockstepForm, Slopes, lockstep_form, why_alone
 from fingerspice.studies.steady import steady_state
@@ -91,11 +91,10 @@ class Task:
         refuse(periodic and given, "periodic=True takes one period, and t_stop or periods is given; allowed: neither")
         if periodic:
             self.periods = 1.0
-        elif not given:
-            if circuit.tran is None:
-                missing = "no t_stop: the deck has no .tran line and none was given"
-                raise InputError(f"{missing}; give t_stop in s, or periods")
+        elif not given and circuit.tran is not None:
             self.t_stop = circuit.tran.stop
+        elif not given:
+            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or periods")
         # Parameters by which the means are differentiated, in the circuit's spelling, each with those that grow in
         # proportion to it: a source's frequency with that of a skin
         self.paths: dict[str, tuple[str, ...]] = {}
@@ -140,8 +139,7 @@ def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dic
         given[name] = array
     sizes = {path: array.size for path, array in given.items() if array.ndim == 1}
     counts = ", ".join(f"{n} ({path})" for path, n in sizes.items())
-    unequal = len(set(sizes.values())) > 1
-    refuse(unequal, f"the arrays have {counts} values; allowed: equal lengths, or single numbers")
+    refuse(len(set(sizes.values())) > 1, f"the arrays have {counts} values; allowed: equal lengths, or single numbers")
     n = max(sizes.values(), default=1)
     scenes = {path: np.ascontiguousarray(np.broadcast_to(array, (n,))) for path, array in given.items()}
     for path, array in scenes.items():
@@ -338,7 +336,8 @@ def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> Non
         task.values["u_gap"][rest] = np.nan
     if not rest.size:
         return
-    task.ordinary = form if isinstance(form, str) else ladder.unmet
+    unmet = "what does not end after half periods or at a sample, or does not meet its error in lockstep"
+    task.ordinary = form if isinstance(form, str) else unmet
     by_period = (task.periods is not None and not task.periodic) or task.traced
     frequency = task.frequencies() if by_period else np.ones(task.n)
     allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
@@ -362,8 +361,7 @@ def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> Non
             task.values[name][(i, slice(len(value))) if name == "u_gap" else i] = value
 
     # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         list(pool.map(alone, rest.tolist()))
 
 
@@ -372,9 +370,8 @@ def _jobs(task: Task, form: LockstepForm) -> list[tuple[int, IntArray]]:
     recorded = form.recording is not None
     count = task.count(np.full(task.n, form.frequency) if recorded else task.frequencies())
     halves = np.round(2.0 * count)
-    good = (task.status < 0) & (halves >= 1.0) & (np.abs(2.0 * count - halves) <= _WHOLE * halves)
-    if any(name.endswith("_periodic") for name in task.outputs):
-        good &= halves >= 2.0
+    least = 2.0 if any(name.endswith("_periodic") for name in task.outputs) else 1.0
+    good = (task.status < 0) & (halves >= least) & (np.abs(2.0 * count - halves) <= _WHOLE * halves)
     jobs = []
     for size in np.unique(halves[good]).astype(int).tolist():
         members = np.flatnonzero(good & (halves == size))
@@ -402,29 +399,25 @@ def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> t
     # Largest of the errors of the gap voltage relative to its peak, and of the force relative to its mean.
     sizes = [0.0 if size is None else float(np.min(size)) for size in (run.u_gap_peak, run.f_el_mean)]
     error = max((x / size for x, size in zip((off.u_gap, off.f_el), sizes, strict=True) if size > 0.0), default=0.0)
-    if paths:
-        # The error of a change by all of the parameter is about ten times that of the run.
-        return {name: _slopes_of(task, circuit, run, name, stop) for name in task.outputs}, Slopes.limit * error
-    # What there is not is None, and so NaN.
-    asked = [name for name in task.outputs if name != "u_gap"]
-    values = {name: np.asarray(run._figures.value(*_OUTPUTS[name]), float) for name in asked}
-    if task.traced:
-        values["u_gap"] = np.atleast_1d(np.asarray(run.u_gap, float))[: -1 if task.periodic else None]
-    return values, error
-
-
-def _slopes_of(task: Task, circuit: Circuit, run: Solution, name: str, stop: float) -> FloatArray:
-    """Derivatives of a mean by the parameters of a task."""
-    known = circuit.parameters
-    # For a change of each parameter by all of itself.
-    each = {path: getattr(one, name) * known[path].value for path, one in run.sensitivities.items()}
-    by = {path: sum(each[other] for other in together) for path, together in task.paths.items()}
-    if task.clock is not None and task.periods is not None and not task.periodic:
-        # The run ends after a number of periods: its end moves with the frequency, and the mean with its end.
-        start = circuit.tran.start if circuit.tran is not None else 0.0
-        gained = float(getattr(run, name.removesuffix("_mean"))[-1]) - float(getattr(run, name))
-        by[task.clock] -= gained * stop / (stop - start)
-    return np.array([x / known[path].value for path, x in by.items()])
+    if not paths:
+        # What there is not is None, and so NaN.
+        asked = [name for name in task.outputs if name != "u_gap"]
+        values = {name: np.asarray(run._figures.value(*_OUTPUTS[name]), float) for name in asked}
+        if task.traced:
+            values["u_gap"] = np.atleast_1d(np.asarray(run.u_gap, float))[: -1 if task.periodic else None]
+        return values, error
+    known, values, start = circuit.parameters, {}, circuit.tran.start if circuit.tran is not None else 0.0
+    for name in task.outputs:
+        # For a change of each parameter by all of itself.
+        each = {path: getattr(one, name) * known[path].value for path, one in run.sensitivities.items()}
+        by = {path: sum(each[other] for other in together) for path, together in task.paths.items()}
+        if task.clock is not None and task.periods is not None and not task.periodic:
+            # The run ends after a number of periods: its end moves with the frequency, and the mean with its end.
+            gained = float(getattr(run, name.removesuffix("_mean"))[-1]) - float(getattr(run, name))
+            by[task.clock] -= gained * stop / (stop - start)
+        values[name] = np.array([x / known[path].value for path, x in by.items()])
+    # The error of a change by all of the parameter is about ten times that of the run.
+    return values, Slopes.limit * error
 
 
 def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], skin: str, device: str) -> Dataset:

@@ -201,38 +201,34 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
     first = form.sources[0][0]
     period = first.waveform.period if first.waveform is not None else None
     frequency = form.frequency or values(first).get("frequency", 1.0 / (period or math.nan))
-    rows = [*_contact_rows(values(form.gap)), 2.0 * np.pi * np.asarray(frequency)]
+    # As `Contact.packed`, for arrays of values: X at 1 V, A0, stress at 1 V, load, c2 mu^2
+    v = values(form.gap)
+    m, n, f_n, per_volt = v["m_exp"], v["n_exp"], np.asarray(v["fn"]), EPS0 * v["eps_r"] / v["d"]
+    alpha, beta = np.asarray(v["alpha"]) * 1e-6, np.asarray(v["beta"]) * 1e-6 * 1e3**n
+    area, p = alpha * f_n**m, 0.5 * (1.0 + 1.0 / m - 1.0 / n)
+    xi = np.sqrt(per_volt * (n * n / (n - m)) * beta ** (1.0 / n) * alpha ** (-1.0 / m)) * area**p / f_n
+    rows = [xi, area, 0.5 * per_volt / v["d"], f_n, v["c2"] * 1e-12 * np.asarray(v["mu"]) ** 2]
+    rows.append(2.0 * np.pi * np.asarray(frequency))
     for element, sign in form.sources:
         recorded = None if form.recording is None else [(0.0, peak_of(form.recording), 0.0)]
         for _, amplitude, phase in recorded or _tones_of(element.waveform, values(element))[0]:
             rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
-    n, others, cell = next(iter(scenes.values())).size, CELL_ROWS * form.stack.c.size, 0
-    out = np.empty((others + len(rows), n))
+    count, others, cell = next(iter(scenes.values())).size, CELL_ROWS * form.stack.c.size, 0
+    out = np.empty((others + len(rows), count))
     for i, row in enumerate(rows, others):
         out[i] = row
-    of_cells = out[:others].reshape(CELL_ROWS, form.stack.c.size, n)
-    for layer, count in zip(form.stack.layers, form.stack.cells, strict=True):
+    of_cells = out[:others].reshape(CELL_ROWS, form.stack.c.size, count)
+    for layer, own in zip(form.stack.layers, form.stack.cells, strict=True):
         assert layer.spec.cells is not None
         cells = layer.spec.cells(values(layer), None)
-        of_cells[:, cell : cell + count] = np.moveaxis(cells.reshape(count, CELL_ROWS, -1), 0, 1)
-        cell += count
+        of_cells[:, cell : cell + own] = np.moveaxis(cells.reshape(own, CELL_ROWS, -1), 0, 1)
+        cell += own
     return out
 
 
 def peak_of(recording: Samples) -> float:
     """Largest sample, V; 1 V if all are 0."""
     return float(np.abs(recording.values).max()) or 1.0
-
-
-def _contact_rows(v: Mapping[str, Value]) -> tuple[Value, ...]:
-    """As `Contact.packed`, for arrays of values: X at 1 V, A0, stress at 1 V, load, c2 mu^2."""
-    m, n, f_n, d = v["m_exp"], v["n_exp"], np.asarray(v["fn"]), v["d"]
-    p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
-    alpha, beta = np.asarray(v["alpha"]) * 1e-6, np.asarray(v["beta"]) * 1e-6 * 1e3**n
-    area = alpha * f_n**m
-    per_volt = EPS0 * v["eps_r"] / d
-    xi = np.sqrt(per_volt * (n * n / (n - m)) * beta ** (1.0 / n) * alpha ** (-1.0 / m)) * area**p / f_n
-    return xi, area, 0.5 * per_volt / d, f_n, v["c2"] * 1e-12 * np.asarray(v["mu"]) ** 2
 
 
 @lru_cache(maxsize=32)
@@ -284,8 +280,6 @@ class Ladder:
     highest_degree = 24  # Of the area's polynomial
     gives_up = True  # Whether scenes are given up for which more steps are no help
     named = ""  # What comes before the message of a scene that cannot be run
-    # Why scenes of a form that lockstep takes may have no result from it
-    unmet = "what does not end after half periods or at a sample, or does not meet its error in lockstep"
 
     def __init__(self, task: Task, form: LockstepForm, members: IntArray) -> None:
         self.task, self.form = task, form
@@ -367,8 +361,7 @@ class Ladder:
                 # A scene whose estimate grows from twice the steps: the explicit steps may be unstable around that
                 # area. And where the area's polynomial of the highest degree is what limits the error.
                 beyond |= ~good & resolved & (error > last)
-                final = level.degree >= highest and before is not None
-                left &= (tail <= ENOUGH * rtol).all(axis=0) | (not final)
+                left &= (tail <= ENOUGH * rtol).all(axis=0) | (level.degree < highest or before is None)
             left &= ~beyond
             outside.append(pending[beyond])
             kept = np.tile(left, self.copies)

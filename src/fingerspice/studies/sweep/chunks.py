@@ -90,11 +90,9 @@ class Work:
         ends = checked_scenes(circuit, plan.spread({name: x[[0, -1]] for name, x in plan.grid.items()}, middle))
         for text in scenes_warnings(circuit, options.get("t_stop"), ends, options.get("skin", "own")):
             warnings.warn(text, FingerspiceWarning, stacklevel=4)
-        scene = plan.spread({name: values[:1] for name, values in plan.grid.items()}, middle)
-        with warnings.catch_warnings():
-            # Of one scene.
-            warnings.simplefilter("ignore", FingerspiceWarning)
-            first = batch(circuit, scene, **options)
+        # The warnings are those of one scene.
+        with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
+            first = batch(circuit, {path: values[:1] for path, values in ends.items()}, **options)
         refuse("u_gap" in first, "outputs are u_gap, and a store has figures, which are one number for each scene")
         self.block: tuple[int, ...] = ()  # Scenes of a chunk along each dimension
         for length in reversed(plan.sizes):
@@ -252,8 +250,7 @@ def stored(
             tidy(work.path)
         took = time.perf_counter() - begun
     found: Dataset = open_zarr(work.path, chunks=None, consolidated=False, zarr_format=3).set_coords(list(work.drawn))
-    named = {str(name): one.attrs[NAMES] for name, one in found.coords.items() if NAMES in one.attrs}
-    found = found.assign_coords(named)[list(work.outputs)]
+    found = found.assign_coords(plan.coordinates)[list(work.outputs)]
     del found.attrs[RUN]
     found.attrs |= {"chunks": len(mine), "chunks_found": there, "chunks_missing": lacking, "seconds": took}
     found.attrs["failures"] = failures[:MESSAGES]
@@ -263,8 +260,7 @@ def stored(
 def _here(work: Work, missing: Sequence[int]) -> Iterator[Ran]:
     """Chunks by this process."""
     # A batch changes the filters for a while, and two of them at once for good.
-    with warnings.catch_warnings(), ThreadPoolExecutor(AT_ONCE) as pool:
-        warnings.simplefilter("ignore", FingerspiceWarning)
+    with warnings.catch_warnings(action="ignore", category=FingerspiceWarning), ThreadPoolExecutor(AT_ONCE) as pool:
         yield from pool.map(partial(work.run_chunk, computing=Lock()), missing)
 
 

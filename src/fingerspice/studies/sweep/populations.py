@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from functools import cached_property, lru_cache, reduce
+from functools import lru_cache, reduce
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,6 +124,8 @@ class Plan:
         starts = [count << i for i in range((self.n // count).bit_length() - 1)]
         self.count, self._steps = count, [self._bits(start, 1) ^ self._bits(0, 1) for start in starts]
 
+    # A process that is sent the plan makes the bits of the first part once.
+    @lru_cache(2)  # noqa: B019
     def _bits(self, start: int, count: int) -> NDArray[np.int64]:
         """Bits of so many points of the unit cube from one on, shape (count, n_drawn)."""
         from scipy.stats import qmc
@@ -132,11 +134,6 @@ class Plan:
         if start:
             engine.fast_forward(start)
         return np.asarray(engine.random(count) * 2.0**BITS, np.int64)
-
-    @cached_property
-    def _first(self) -> NDArray[np.int64]:
-        """Bits of the first part: a process that is sent the plan makes them once."""
-        return self._bits(0, self.count)
 
     # Two chunks may run at once, and those after them mostly have the same draws.
     @lru_cache(2)  # noqa: B019
@@ -149,7 +146,7 @@ class Plan:
         if not self.drawn:
             return {}
         added = (step for i, step in enumerate(self._steps) if number >> i & 1)
-        return self.quantiles(np.asarray(reduce(np.bitwise_xor, added, self._first) * 2.0**-BITS, float))
+        return self.quantiles(np.asarray(reduce(np.bitwise_xor, added, self._bits(0, self.count)) * 2.0**-BITS, float))
 
 
 def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, tuple[str, ...], dict[str, FloatArray]]:
