@@ -25,6 +25,18 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
     gc.set_threshold(*threshold)
 
 
+@pytest.fixture(scope="module")
+def forked_workers() -> Iterator[None]:
+    """Workers are forks of one process that has imported what they need; others start as a user's do."""
+    utils = pytest.importorskip("distributed.utils")
+    with pytest.importorskip("dask").config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        # Dask's own list, which it sets first, is without this package.
+        utils.get_mp_context().set_forkserver_preload(
+            ["distributed", "scipy.stats", "xarray", "fingerspice.studies.sweep.chunks"]
+        )
+        yield
+
+
 def pytest_configure() -> None:
     """Of several workers one compiles what steps stacks, and one what steps networks, which else all would at once."""
     worker = os.environ.get("PYTEST_XDIST_WORKER")

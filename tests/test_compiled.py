@@ -159,9 +159,9 @@ LINES = [
 @faults
 def test_every_wait_is_announced_with_its_own_length_also_behind_another_bar() -> None:
     program = partial(start, Path.cwd(), entry=[sys.executable, "-c", WAITS], env={**os.environ, "COLUMNS": "80"})
-    _, err = program().communicate(timeout=120)
-    assert err.splitlines() == LINES
+    logged = program()
     seen, _ = on_a_terminal(program)
+    assert logged.communicate(timeout=120)[1].splitlines() == LINES
     seen = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", seen)
     for line in LINES:
         assert re.search(re.escape(line[19:].partition(":")[0]) + r"\s+\S+\s+0:00:01", seen)

@@ -122,11 +122,7 @@ def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
     assert fs.read_netlist(path)["Xgap"].values["d"] == 3.5e-6
 
 
-@pytest.mark.parametrize(("line", "value"), [
-    ("R9 drive 0 r=10k", 1e4), ("R9 drive 0 r={g}", 1e4), ("R9 drive 0 R={2*5k}", 1e4), ("R9 drive 0 10k m=4", 2.5e3),
-    ("R9 drive 0 r=10k m=0.5", 2e4), ("R9 drive 0 resistance=10k", 1e4), ("C9 drive 0 c=1n", 1e-9),
-    ("C9 drive 0 c='2*1n' m=3 ic=0", 6e-9), ("C9 drive 0 1n m=2", 2e-9),
-])  # fmt: skip
+@pytest.mark.parametrize(("line", "value"), listed("parts"))
 def test_values_of_r_and_c_by_name_and_by_number_of_parts(line: str, value: float) -> None:
     circuit, said = read((".end", f".params g=10k\n{line}\n.end"))
     assert circuit[line[:2]].values["value"] == pytest.approx(value, rel=1e-15)
@@ -168,14 +164,7 @@ def test_what_only_ngspice_or_ltspice_needs_is_not_worth_a_word(word: str, comma
     assert not command("run", "pad.cir", "--no-plot").lines
 
 
-RIGHT = [
-    *("V1 a 0 SIN(0,200,100)", "V1 a 0 SIN(0, 200, 100)", "V1 a 0 PWL(0,0 1m,5 2m,0)", "V1 a 0 PWL(0 0, 1m 5, 2m 0)"),
-    *("R1 1,2 10k", "R1 a b {max(1,2)*1k}", "R1 a b '1k*max(1,2)'", ".param w={min(3,5)}", ".ic v(a)=1, v(b)=2"),
-    *("X1 a,b,c LAYER d=1u,eps_r=2", ".tran 1u,50m", "V1 a 0 SIN 0,200,100", "V1 a 0 PWL(0,0,1m,5)"),
-]
-
-
-@pytest.mark.parametrize(("line", "said"), [*listed("commas"), *((line, None) for line in RIGHT)])
+@pytest.mark.parametrize(("line", "said"), [*listed("commas"), *((line, None) for line in listed("right_commas"))])
 def test_a_decimal_comma_is_named_and_a_comma_that_separates_is_right(line: str, said: str | None) -> None:
     found = decimal_comma(line)
     assert found is None if said is None else (found or "").endswith(said)

@@ -158,7 +158,6 @@ def test_shares_that_fit_to_the_last_bit_are_the_likelier_errors(circuit, data, 
     assert fs.fit(circuit, data, ["Xgap.d"], starts=1, rtol=1e-4, skin="follow").objective == 0.0
 
 
-NAMED = {"finger": ["a", "b"], "f_el_mean": [0.1, 0.2]}
 ONE = {"f_el_mean": [1e-2]}
 
 

@@ -109,7 +109,7 @@ def test_memory_that_is_kept_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_reading_the_same_again_keeps_nothing() -> None:
-    count = cases(400, 80)
+    count = cases(400, 40)
 
     def blocks_after() -> int:
         fuzz.run(count, seed="again")

@@ -43,7 +43,8 @@ REQUESTS: dict[str, tuple[str, dict[str, Any]]] = {
     "run": ("fingerpad", {"scenes": GAPS, "periods": 2, "outputs": ["f_el_mean", "f_t_rms", "f_el_mean_periodic"]}),
     "periodic": ("fingerpad", {"scenes": GAPS, "periodic": True, "rtol": 1e-6}),
     "square": ("fingerpad", {"scenes": GAPS, "periods": 2, "drive": "SQUARE(150 100)"}),
-    "AM": ("am_carrier", {"scenes": GAPS, "t_stop": 0.01, "outputs": ["f_el_mean", "f_t_rms"]}),
+    # As in tests/test_batch.py, for which the processor's code is compiled already.
+    "AM": ("am_carrier", {"scenes": GAPS, "t_stop": 0.01, "rtol": 1e-6, "outputs": ["f_el_mean", "f_t_rms"]}),
     "voltages": ("fingerpad", {"scenes": {"Xgap.d": [3e-6, 4e-6]}, "periods": 1, "outputs": ["u_gap"]}),
     **{path: ("fingerpad", {"scenes": {path: values}, "periods": 3, "rtol": 1e-5}) for path, values in VALUES.items()},
     **{

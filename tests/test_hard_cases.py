@@ -318,8 +318,7 @@ def test_a_hundred_thousand_cycles_do_not_drift(shape: str, method: str) -> None
     assert solution.stats["steps"] <= 8 * CYCLES
 
 
-@every_law
-@pytest.mark.parametrize("shape", LONG)
+@pytest.mark.parametrize(("shape", "law"), by_turns(LONG))
 def test_ten_million_cycles_end_like_the_first_settled_one(shape: str, law: str) -> None:
     source, segments = LONG[shape]
     cycles = 100 * CYCLES

@@ -36,9 +36,9 @@ def profile(seed: int, duration: float = 0.03, rate: float = 48e3, band: float =
 # Of 50 random profiles for each kind of circuit, those with the largest miss, and one in a circuit without a ground.
 HARDEST = [
     (1013, "stack", None, "local"), (1013, "stack", None, "mobile"), (1028, "stack", 2000.0, "local"),
-    (1028, "stack", 2000.0, "mobile"), (1013, "dispersive", None, "local"), (1028, "dispersive", 2000.0, "local"),
-    (1010, "amplifier", None, "local"), (1005, "amplifier", 2000.0, "local"), (3, "ungrounded_user", None, "local"),
-]  # fmt: skip
+    (1013, "dispersive", None, "local"), (1028, "dispersive", 2000.0, "local"), (1010, "amplifier", None, "local"),
+    (1005, "amplifier", 2000.0, "local"), (3, "ungrounded_user", None, "local"), (1028, "stack", 2000.0, "mobile"),
+][: cases(9, 8)]  # fmt: skip
 
 
 @pytest.mark.parametrize(("seed", "kind", "carrier", "law"), HARDEST)

@@ -8,9 +8,9 @@ import pytest
 import fingerspice as fs
 import network_errors
 from network_errors import Beside
-from scenes import DECKS, every_law, shipped
+from scenes import DECKS, cases, every_law, shipped
 
-NETWORKS = 32
+NETWORKS = cases(32, 24)
 
 
 @pytest.fixture(scope="module")

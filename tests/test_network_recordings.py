@@ -48,10 +48,10 @@ def test_a_finger_in_a_network_follows_the_hand_written_equations() -> None:
 
 
 def test_stated_errors_cover_the_true_ones_and_what_was_asked_is_met() -> None:
-    count = cases(100, 9)
-    drawn = [recording_errors.draw(number, 300, network=True) for number in range(200, 200 + count)]
-    found = [x for one in drawn for x in recording_errors.judge(one)]
-    assert len(found) > 4 * count
+    # Of the first, those that are followed sample by sample; with 213 in place of 202, whose reference takes seconds.
+    numbers = cases([*range(200, 300)], [200, 204, 206, 207, 208, 213])
+    found = [x for n in numbers for x in recording_errors.judge(recording_errors.draw(n, 300, network=True))]
+    assert len(found) > 4 * len(numbers)
     recording_errors.assert_that_stated_errors_hold(found)
 
 

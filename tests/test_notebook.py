@@ -58,13 +58,7 @@ def test_pictures_in_a_loop_or_before_a_semicolon_are_shown_once_each(outputs, n
     assert [len(picture) > 10_000 for picture in pictures] == [True] * count
 
 
-@pytest.mark.parametrize(
-    ("number", "said"),
-    [
-        (0, "Sine(200 V, 100 Hz)"), (1, "electroadhesive force"), (4, "electroadhesive force"), (6, "mean force"),
-        (8, "f_el"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("number", "said"), listed("cell_tables"))
 def test_a_result_is_shown_as_a_table(outputs: list[list[Any]], number: int, said: str) -> None:
     page = shown(outputs[number])["text/html"]
     assert "<table" in page
