@@ -106,7 +106,7 @@ class Track(Stepping):
     The error of the gap voltage is at most `tol` (V) in every step; its area's curve reaches `top` (V) if not 0.
     """
 
-    def __init__(self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True) -> None:
+    def __init__(self, problem: Problem, rtol: float, tol: float, top: float = 0.0) -> None:
         scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
 
         def make() -> tuple[System, float]:
@@ -120,10 +120,9 @@ class Track(Stepping):
         # Of the layer through which the charge is computed.
         self.capacitance = float(model.slow[-3]) * model.area0
         super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown)
-        self.error = np.zeros(n + 1)
+        self.rates, self.error = self.system.rates, np.zeros(n + 1)
         self.control["branch_length"], self.control["margin"] = np.inf, 1.0
         self.load(problem.initial)
-        self.look_for_period(self.system.rates, np.ones(n), repeat)
 
     def load(self, initial: State) -> None:
         super().load(initial)
@@ -308,7 +307,7 @@ def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list
 class March(Stepping):
     """One integration of a network, with an error of at most `tol` times `u_scale` (V) in every step."""
 
-    def __init__(self, problem: Problem, rtol: float, tol: float, u_scale: float, repeat: bool) -> None:
+    def __init__(self, problem: Problem, rtol: float, tol: float, u_scale: float) -> None:
         scene, size = problem.scene, problem.initial.y.size
         n_s, n_area = len(scene.network.waveforms), scene.net.gap.size
         self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
@@ -322,10 +321,8 @@ class March(Stepping):
         self.shortest = problem.network.waveform.shortest_time()
         self.references = known_references(scene, self.decade)
         self.form = self.references.form()
-        self.held, cells = held(self.form), self.form.c.size
+        self.rates, self.held, cells = self.form.rates, held(self.form), self.form.c.size
         self.work = new_network_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
-        scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
-        self.look_for_period(self.form.rates, scale, repeat)
 
     @property
     def rounding(self) -> list[float]:
@@ -350,33 +347,30 @@ class March(Stepping):
         more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
         self.step[0]["most"] = taken + int(more)
         while (code := super().march(sources, t_end, looks)) == readout.REFERENCE:
-            self._add_reference()
+            # Add the reference areas that the compiled loop needs next, and that it has written to `wanted`.
+            scene, known, at = self.problem.scene, self.references, self.work.at
+            wanted = tuple(map(int, known.arrays.wanted))
+            if known.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
+                # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
+                levels = tuple(map(int, known.arrays.levels[at[0]]))
+                self.references = known = known_references(scene, self.decade, anew=True)
+                if any(levels):
+                    known.add(scene, levels)
+                at[0] = known.count - 1
+                self.work.own.keys[:] = self.work.own.key[:] = -1
+            known.add(scene, wanted)
         return code
 
     def jump(self, after: FloatArray) -> bool:
         # With sources that stay at these values.
         return self.march(ramp(after, after, self.t), self.t, no_looks()) == readout.DONE
 
-    def _add_reference(self) -> None:
-        """Add the reference areas that the compiled loop needs next, and that it has written to `wanted`."""
-        known, at = self.references, self.work.at
-        wanted = tuple(map(int, known.arrays.wanted))
-        if known.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
-            # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
-            levels = tuple(map(int, known.arrays.levels[at[0]]))
-            self.references = known = known_references(self.problem.scene, self.decade, anew=True)
-            if levels != (0,) * len(levels):
-                known.add(self.problem.scene, levels)
-            at[0] = known.count - 1
-            self.work.own.keys[:] = self.work.own.key[:] = -1
-        known.add(self.problem.scene, wanted)
 
-
-def stepping(problem: Problem, rtol: float, tol: float, u_scale: float, top: float, repeat: bool) -> Track | March:
+def stepping(problem: Problem, rtol: float, tol: float, u_scale: float, top: float) -> Track | March:
     """An integration with an error of `tol` times `u_scale` (V) in every step; for `top` see `Track`."""
     if problem.network.stack is None:
-        return March(problem, rtol, tol, u_scale, repeat)
-    return Track(problem, rtol, tol * u_scale, top, repeat)
+        return March(problem, rtol, tol, u_scale)
+    return Track(problem, rtol, tol * u_scale, top)
 
 
 def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, repeat: bool = True) -> Run:
@@ -397,9 +391,8 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     # What is left of sources that cancel has fewer digits than these; what a gap takes of a source has as many as that.
     finest = FINEST * max(1.0, problem.scene.u_size / (met or u_scale))
     while True:
-        one = stepping(problem, rtol, max(tol, finest), u_scale, top, repeat)
-        if tries_out:
-            one.try_out(rtol)
+        one = stepping(problem, rtol, max(tol, finest), u_scale, top)
+        one.look(rtol if tries_out else math.inf, repeat)
         try:
             run = integrate(one, tables, progress)
         except OutOfRangeError as error:
@@ -408,12 +401,10 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
         run.by_layer = True
         run.end_where_it_stopped()
         run.nfev = nfev = nfev + run.nfev
-        run.stats["repeated"] = one.repeated
-        run.continuous = one.recorded()
         one.stated(run)
         attempts += 1
         worst = excess_of(run.gaps, problem.rounding) / rtol
-        # A trial (`try_out`) that predicts too large an error stops the run early, with ERROR_NOT_MET.
+        # An early judgement that predicts too large an error stops the run, with ERROR_NOT_MET.
         is_whole = run.status is not Status.ERROR_NOT_MET
         if is_whole and (run.status is not Status.SUCCESS or worst <= 1.0):
             return run

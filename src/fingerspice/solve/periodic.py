@@ -272,7 +272,7 @@ class Search(Period):
         """One pass by exponential steps; None where they fail before the end."""
         while True:
             if self.one is None:
-                self.one = stepping(self.problem, self.rtol, tol, self.scale, self.top, False)
+                self.one = stepping(self.problem, self.rtol, tol, self.scale, self.top)
             one = self.one
             one.again(initial, tol * self.scale)
             try:

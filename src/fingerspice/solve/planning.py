@@ -15,7 +15,6 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import circuit_warnings, course_warnings, spectrum_warning
 from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.statespace import driving
-from fingerspice.engine.one_area.model import Model
 from fingerspice.physics.contact import inverse_area, inverse_area_range
 from fingerspice.results.outcome import Plan, Status
 from fingerspice.results.record import Record
@@ -65,16 +64,12 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
 
 def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     scene, model, span = problem.scene, problem.scene.model, problem.t_stop - problem.t_start
-    if model is None:
-        changed, area = math.nan, float(scene.net.area0[0]) if problem.network.areas else math.nan
-        if not scene.coupled:
-            changed = 0.0
-        elif len(problem.network.sources) == problem.network.n_voltage:
-            changed = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
-        best, reason = _of_network(problem, changed)
-    else:
-        changed, area = _change(model.curve, scene.u_peak) if model.coupled else (0.0, model.area0)
-        best, reason = _of_stack(problem, model, rtol, changed)
+    area, changed = float(scene.net.area0[0]) if scene.fixed else math.nan, math.nan if scene.coupled else 0.0
+    if model is not None and model.coupled:
+        changed, area = _change(model.curve, scene.u_peak)
+    elif scene.coupled and len(problem.network.sources) == problem.network.n_voltage:
+        changed = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
+    best, reason = _best(problem, rtol, changed)
     chosen = best if tier == "auto" else tier
     if chosen != best:
         _refuse(problem, chosen, best)
@@ -116,30 +111,24 @@ def _refuse(problem: Problem, tier: str, best: str) -> None:
         raise InputError(f"the linear tier takes the area as fixed, and {what} needs the one that follows the voltage")
 
 
-def _of_network(problem: Problem, changed: float) -> tuple[str, str]:
-    """The tier of a network, and the reason: linear where its areas are fixed, else coupled.
+def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
+    """The lightest tier that is valid, and the reason.
 
     With capacitors outside the layers, a small change of an area may have a large effect on the voltages over many
     periods. No useful bound of that effect is known beforehand: a network is coupled however little its areas change.
     """
-    scene, network = problem.scene, problem.network
-    if not scene.coupled:
-        which = f"the areas are {scene.area_mode}" if network.areas else "no element has an area"
-        return "linear", f"{which}, so the circuit is linear"
-    several = len(network.fingers) > 1
-    follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
-    if math.isnan(changed):
-        return "coupled", f"{follows}; by how much is not known beforehand: a current source sets no bound"
-    return "coupled", f"{follows}, {'each ' if several else ''}by up to {_percent(changed)} of its middle"
-
-
-def _of_stack(problem: Problem, model: Model, rtol: float, changed: float) -> tuple[str, str]:
-    """The tier of a stack, the lightest of all three that is valid, and the reason."""
-    leaks = model.rate.any() or model.rate0.any()
-    if not leaks and not (model.mobile and model.coupled and problem.stored > 0.0):
+    scene, model, several = problem.scene, problem.scene.model, len(problem.network.fingers) > 1
+    stores = scene.coupled and model is not None and model.mobile and problem.stored > 0.0
+    if model is not None and not (model.rate.any() or model.rate0.any() or stores):
         return "algebraic", "no layer leaks, so the voltages follow the source at once"
-    if not model.coupled:
-        return "linear", f"the area is {problem.scene.area_mode}, so the circuit is linear"
+    if not scene.coupled:
+        which = f"the area{' is' if model is not None else 's are'} {scene.area_mode}"
+        return "linear", f"{which if scene.fixed else 'no element has an area'}, so the circuit is linear"
+    if model is None:
+        follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
+        if math.isnan(changed):
+            return "coupled", f"{follows}; by how much is not known beforehand: a current source sets no bound"
+        return "coupled", f"{follows}, {'each ' if several else ''}by up to {_percent(changed)} of its middle"
     free = not model.rate0.any()
     if model.mobile or not (free or changed <= 0.2 * rtol):
         return "coupled", f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
@@ -165,7 +154,7 @@ def _change(curve: FloatArray, u_peak: float) -> tuple[float, float]:
 
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Warnings for every limit of the model that the run exceeds."""
-    success, several = run.status is Status.SUCCESS, len(record.fingers) > 1
+    success, several, net = run.status is Status.SUCCESS, len(record.fingers) > 1, problem.scene.net
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
     key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
     yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
@@ -175,8 +164,14 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
         yield run.note
     for finger, (name, contact) in enumerate(record.fingers):
         u_peak, f_peak, u_error, _ = run.gaps[finger].tolist()
-        where, unloaded = f" of {name}" if several else "", record.net.area0[problem.network.fingers[finger]]
-        least, largest = _areas_met(problem, record, finger, u_peak)
+        where, i = f" of {name}" if several else "", problem.network.fingers[finger]
+        unloaded = least = largest = float(net.area0[i])
+        if net.slow[i] >= 0:
+            area = record.each("area")[finger]
+            least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
+        elif net.gap[i] >= 0:
+            least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
+            largest = max(unloaded, least)
         if u_peak > BREAKDOWN_VOLTAGE:
             limit = f"air breaks down above about {BREAKDOWN_VOLTAGE:g} V (Paschen minimum 327 V)"
             yield f"the gap voltage{where} reaches {u_peak:.4g} V; {limit}, which the model does not contain"
@@ -203,19 +198,6 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
             if field > strength:
                 met = f"the field in {layer.name} reaches {field:.3g} V/m at the outputs"
                 yield f"{met}; its dielectric strength is {strength:.3g} V/m"
-
-
-def _areas_met(problem: Problem, record: Record, finger: int, u_peak: float) -> tuple[float, float]:
-    """Least area of a finger in the run, infinite where it is fixed, and the largest that its stress acts on, m^2."""
-    net, i = problem.scene.net, problem.network.fingers[finger]
-    unloaded = float(net.area0[i])
-    if net.slow[i] >= 0:
-        area = record.each("area")[finger]
-        return float(area.min(initial=math.inf)), float(area.max(initial=0.0))
-    if net.gap[i] < 0:
-        return math.inf, unloaded
-    least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
-    return least, max(unloaded, least)
 
 
 def _source_warnings(problem: Problem) -> Iterator[str]:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, Remembering, real_number
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, Remembering, read_only, real_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import area_given, time_slip
@@ -27,7 +27,7 @@ from fingerspice.solve.starting import initial_state, to_loop
 from fingerspice.waveforms import sampling
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, same_time, source_table
-from fingerspice.waveforms.waveform import DC, Waveform, require
+from fingerspice.waveforms.waveform import DC, Waveform, refuse, require
 
 #: Most periods (or shortest time scales) of the source in a run, and most breakpoints: they take hours and a gigabyte.
 MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9
@@ -140,8 +140,8 @@ def prepare(
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
     tran, wave, stop = circuit.tran, scene.network.waveform, t_stop
     if stop is None:
-        if tran is None and (t_eval is None or not t_eval.size):
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+        endless = "no t_stop: the deck has no .tran line and none was given; give t_stop in s"
+        refuse(tran is None and (t_eval is None or not t_eval.size), endless)
         stop = float(t_eval[-1]) if tran is None else t_start + tran.stop  # type: ignore[index]
     require(math.isfinite(stop) and stop > t_start, "t_stop", f"{stop:g} s", f"more than {t_start:g} s")
     if t_eval is not None:
@@ -176,9 +176,8 @@ def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
         (span / waveform.shortest_time(), "periods or time constants", MOST_PERIODS),
         (span * waveform.breakpoint_rate(), "breakpoints", MOST_BREAKPOINTS),
     ):
-        if not count <= most:
-            told = f"{span:g} s long, {count:.3g} {what} of its source"
-            raise InputError(f"the run is {told}; allowed: at most {most:.0e} of them")
+        told = f"{span:g} s long, {count:.3g} {what} of its source"
+        require(count <= most, "the run", told, f"at most {most:.0e} of them")
 
 
 def check_outputs(circuit: Circuit, count: float) -> None:
@@ -189,9 +188,9 @@ def check_outputs(circuit: Circuit, count: float) -> None:
         return sum(of_device.get(e.device, 0) + e.spec.is_layer for e in circuit.elements) + len(nodes) + 1
 
     size = 8.0 * (signals := circuit.remember(("signals",), counted)) * count
-    if not size <= MOST_BYTES:
-        told = f"the run is one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB; allowed: at most"
-        raise InputError(f"{told} {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning")
+    told = f"one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB"
+    allowed = f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning"
+    require(size <= MOST_BYTES, "the run", told, allowed)
 
 
 def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
@@ -254,9 +253,7 @@ def _output_times(problem: Problem, jumps: str) -> FloatArray:
     if at.size:
         nearest = at[np.searchsorted(0.5 * (at[1:] + at[:-1]), grid)]
         grid = grid[np.abs(grid - nearest) > 1e-9 * step]
-    t = np.sort(np.concatenate([grid, at, at]))
-    t.flags.writeable = False
-    return t
+    return read_only(np.sort(np.concatenate([grid, at, at])))
 
 
 PERIODS_PER_WINDOW, BREAKPOINTS_PER_WINDOW = 4096.0, 2000.0

@@ -18,7 +18,7 @@ from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
-from fingerspice.results.steps import Recorded, Recorder
+from fingerspice.results.steps import Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
 from fingerspice.waveforms.sampling import same_time
@@ -26,7 +26,7 @@ from fingerspice.waveforms.sampling import same_time
 # Runs of fewer periods are integrated throughout, because nothing would be saved.
 FEWEST_PERIODS = 6.0
 # Number of the source's periods after which a run's error is first compared with its peaks, where ten times as many
-# are left.
+# are left: the tolerance was chosen before the peaks were known, and a run where it proves too large ends there.
 TRIAL_PERIODS = 2.0
 # Remaining change allowed over all later periods, as a fraction of the error allowed in a step.
 _SHARE = 1.0 / 3.0
@@ -62,11 +62,8 @@ class Stepping(Integration):
     area_error: float  # Relative error of the areas' polynomials
     capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
     charge_safety = 1.0  # Stated error of the charge over the estimate
+    rates: FloatArray  # Decay rates of the modes, among them those at 0 V, 1/s
     fresh: list[Any] | None = None  # What an integration that begins `again` sets its arrays to
-    # The stated error is compared with this after a few periods, where `try_out` was called. The tolerance was chosen
-    # before the peaks of the gaps were known; if it proves too large, the run ends there and not at its end before it
-    # is repeated.
-    asked = math.inf
 
     def __init__(self, problem: Problem, tol: float, shown: int, width: int) -> None:
         self.controls = np.zeros(1, readout.CONTROL)
@@ -87,20 +84,25 @@ class Stepping(Integration):
         self.outputs = Outputs(self.t_out, self.left, self.out)
         self.repeated = 0  # Number of periods that were not integrated but repeat another
         self.recorder = Recorder(shown)
+        self.looks = loop.no_looks()
         self.keep(0)
 
-    def look_for_period(self, rates: FloatArray, scale: FloatArray, repeat: bool) -> None:
-        """Prepare the looks of the run, none unless it is to `repeat` a period; `rates` (1/s) are those at 0 V."""
-        problem, values = self.problem, np.zeros(loop.N_VALUES)
-        start, live = max(problem.t_start, problem.network.waveform.settled), [x for x in rates.flat if x > 0.0]
+    def look(self, asked: float, repeat: bool) -> None:
+        """Look for the periodic state, if the run is to `repeat` a period; judge its error early, against `asked`."""
+        problem, values, self.asked = self.problem, np.zeros(loop.N_VALUES), asked
+        start, live = max(problem.t_start, problem.network.waveform.settled), [x for x in self.rates.flat if x > 0.0]
         values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, self.period
         values[loop.ALLOWED], values[loop.HAS_CHARGE] = _SHARE * self.pace.tol, problem.charge
         values[loop.LOOKED] = -1.0
         # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
         values[loop.RATE] = loop.RATE_SHARE * min(live, default=math.inf)
         values[loop.DISTANCE] = values[loop.REMAINING] = values[loop.TRIAL] = math.inf
-        self.periods = (problem.t_stop - start) / self.period * (1.0 + 1e-12)
-        values[loop.NEXT] = start if repeat and self.periods >= FEWEST_PERIODS else math.inf
+        periods = (problem.t_stop - start) / self.period * (1.0 + 1e-12)
+        values[loop.NEXT] = start if repeat and periods >= FEWEST_PERIODS else math.inf
+        if asked < math.inf and periods >= 1.0 + 10.0 * TRIAL_PERIODS:
+            values[loop.TRIAL] = start + TRIAL_PERIODS * self.period
+            values[loop.ACCEPTABLE] = asked / SAFETY
+        scale = np.append(np.ones(self.n), np.full(self.n_slow, self.largest))
         self.looks = Looks(values, np.zeros(scale.size), scale)
 
     def again(self, initial: State, tol: float) -> None:
@@ -120,13 +122,6 @@ class Stepping(Integration):
     @property
     def t(self) -> float:
         return float(self.control["t"])
-
-    def try_out(self, asked: float) -> None:
-        """Compare the stated error with `asked` after a few periods, if many are left."""
-        self.asked, values = asked, self.looks.values
-        if self.periods >= 1.0 + 10.0 * TRIAL_PERIODS:
-            values[loop.TRIAL] = values[loop.START] + TRIAL_PERIODS * self.period
-            values[loop.ACCEPTABLE] = asked / SAFETY
 
     @abstractmethod
     def circuit(self, sources: Sources) -> Circuit:
@@ -169,8 +164,11 @@ class Stepping(Integration):
         return found
 
     def stated(self, run: Run) -> None:
-        """Write the stated errors and the margin into a run."""
-        peaks = self.stated_peaks()
+        """Write the recorded steps, the stated errors and the margin into a run."""
+        self.recorder.drain(self.counters)
+        peaks, shown = self.stated_peaks(), self.problem.scene.shown
+        run.continuous = self.recorder.finish(self.problem.first, partial(Record, shown.network, shown.net))
+        run.stats["repeated"] = self.repeated
         run.gaps, run.margin = np.array([peaks[i] for i in self.gaps]).reshape(-1, 4), self.margin
         run.node_error = peaks[-1][readout.ERROR_U]
         if not self.pace.charge:
@@ -263,9 +261,3 @@ class Stepping(Integration):
             if peak[readout.PEAK_U] > 0.0:
                 peak[readout.ERROR_F] += off * 2.0 * peak[readout.PEAK_F] / peak[readout.PEAK_U]
         self.repeated += periods
-
-    def recorded(self) -> Recorded | None:
-        """The recorded steps of the run so far."""
-        self.recorder.drain(self.counters)
-        shown = self.problem.scene.shown
-        return self.recorder.finish(self.problem.first, partial(Record, shown.network, shown.net))
