@@ -38,25 +38,20 @@ from fingerspice.solve.scenes import Scene
 from fingerspice.solve.starting import as_shown, from_loop, model_of, to_loop
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
 
-# Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each.
-MOST_SYSTEMS = 16
+MOST_SYSTEMS = 16  # Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each
 # Stated error of the charge over the estimate. It comes from a stack whose layers all leak fast: compared with a
 # reference, the errors of gap voltage and charge were 1.5 times the estimates, because they peak between the points of
 # the estimate; and from scene 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
 CHARGE_SAFETY = 1.75
-# Number of sets of references cached with a scene: one for each thread and decade of tolerances.
-MOST_SETS = 16
+MOST_SETS = 16  # Number of sets of references cached with a scene: one for each thread and decade of tolerances
 # Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
 MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
-# Number of references cached with the network, for runs with other sources.
-MOST_KEPT = 16
-# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method. Where
-# an area strongly affects the charge of a stiff mode, the fixed-point iteration converges only with steps of the
-# mode's own time constant.
+MOST_KEPT = 16  # Number of references cached with the network, for runs with other sources
+# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method: where
+# an area strongly affects the charge of a stiff mode, only steps of the mode's own time constant converge.
 MOST_STEPS = 100
 ATTEMPTS = 6
-# Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.
-GUESS = 1.0
+GUESS = 1.0  # Voltage scale of a circuit whose sources give none, before any voltage has been computed, V
 
 
 class _Scratch(threading.local):
@@ -117,8 +112,7 @@ class Track(Stepping):
         self.system, self.area_error = scene.remember(("system", decade, top), make, MOST_SYSTEMS)
         model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
-        # Of the layer through which the charge is computed.
-        self.capacitance = float(model.slow[-3]) * model.area0
+        self.capacitance = float(model.slow[-3]) * model.area0  # Of the layer through which the charge is computed
         super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown)
         self.rates, self.error = self.system.rates, np.zeros(n + 1)
         self.control["branch_length"], self.control["margin"] = np.inf, 1.0

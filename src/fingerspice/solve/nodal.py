@@ -41,8 +41,7 @@ LOCAL_SHARE, FINEST, ROUNDED = 0.2, 1e-14, 4e-15
 PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 # They are also compared after at most so many edges of the sources, at these fractions of the time to the next edge.
 MOST_EDGES, AFTER_EDGE = 256, np.geomspace(1e-15, 0.3, 30)
-# Number of attempts, and time after which the expected time of a run is announced, s.
-ATTEMPTS, TELL_AFTER = 6, 3.0
+ATTEMPTS, TELL_AFTER = 6, 3.0  # Number of attempts, and time after which the expected time of a run is announced, s
 # Difference of a fold's times in two successive runs at which the fold is accepted at once, over its time; and the one
 # at which it is accepted after the last attempt, over its time or the source's shortest time, if that is longer.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
@@ -270,17 +269,14 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
 
     Returns the largest stated error relative to the peak of its gap, of voltages and forces.
     """
-    both, gaps = (alike + ROUNDED) * u_scale, []
-    fine, coarse = probed.record(problem), beside.record(problem)
+    gaps, fine, coarse = [], probed.record(problem), beside.record(problem)
     # Between the times compared, the steps may have seen larger voltages, and forces if the area has no time constant.
     met = itertools.chain(run.gaps[:, :2].tolist(), itertools.repeat((0.0, 0.0)))
     for (u, f), (v, g), (u_met, f_met) in zip(gap_signals(fine), gap_signals(coarse), met, strict=False):
         peak, force = max(float(np.abs(u).max(initial=0.0)), u_met), max(float(f.max(initial=0.0)), f_met)
-        # F ~ u^2: an error du of u is an error 2 F du / u of F.
-        moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
-        gaps.append((peak, force, apart(u, v) + both, apart(f, g) + moved))
-    run.gaps = np.array(gaps).reshape(-1, 4)
-    run.node_error = runs.nodes_apart(fine, coarse) + both
+        gaps.append((peak, force, apart(u, v), apart(f, g)))
+    run.gaps, run.node_error = np.array(gaps).reshape(-1, 4), runs.nodes_apart(fine, coarse)
+    run.add_error((alike + ROUNDED) * u_scale)
     if problem.charge:
         at = slice(problem.initial.y.size - problem.initial.s_before.size, problem.initial.y.size)
         run.charge_error = apart(probed.rows[:, at], beside.rows[:, at])

@@ -25,16 +25,14 @@ from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DOUBLE, refuse, require
 
-# Number of plans cached with a scene.
-MOST_PLANS = 16
+MOST_PLANS = 16  # Number of plans cached with a scene
 TIERS = ("algebraic", "linear", "coupled")
 # A scene is called stiff if its fastest rate times the source's shortest time exceeds this: stability alone would then
 # limit the steps of an explicit method.
 STIFF = 300.0
 REPEATS = "periodic: once a period no longer changes the state, later ones repeat it"
 BREAKDOWN_VOLTAGE = 300.0
-# Smallest contact area without a warning, relative to the area at 0 V.
-LEAST_AREA = 0.2
+LEAST_AREA = 0.2  # Smallest contact area without a warning, relative to the area at 0 V
 # Smallest distance to the fold of the mobile law without a warning: a voltage a few percent larger reaches the fold.
 NEAR_FOLD = 0.2
 # Shortest event (s) in a user's function that may be missed without a warning, half a period of 10 kHz: drives of a
@@ -158,8 +156,14 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
     key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
     yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
-    if success and problem.network.waveforms and not run.gaps[:, 0].any():
-        yield from _off_warning(problem)
+    waves, currents = problem.network.waveforms, problem.network.waveforms[problem.network.n_voltage :]
+    off = success and waves and not run.gaps[:, 0].any() and problem.scene.u_peak == 0.0
+    if off and not any(wave.peak(problem.t_start, problem.t_stop) for wave in currents):
+        if small := ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None):
+            alone = f"{small} has AC alone, which drives sweeps (fingerspice ac)"
+            yield f"the sources are 0 all the time: {alone}; a sine in time is SIN(VO VA FREQ)"
+        elif not problem.initial.y.any() and not any(problem.t_stop <= wave.course[0] < math.inf for wave in waves):
+            yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"
     if run.note and success:
         yield run.note
     for finger, (name, contact) in enumerate(record.fingers):
@@ -210,18 +214,3 @@ def _source_warnings(problem: Problem) -> Iterator[str]:
         mend = "give Function(f, breaks=(...)) its edges, or the circuit a .tran of a shorter TSTEP"
         yield f"the source is a function, {seen}; {mend}"
     yield from spectrum_warning(problem.circuit, problem.network.waveform, problem.t_stop)
-
-
-def _off_warning(problem: Problem) -> Iterator[str]:
-    """A warning about sources that are 0 in the whole run, unless a charge of the start drives it."""
-    currents = problem.network.waveforms[problem.network.n_voltage :]
-    if any((problem.scene.u_peak, *(wave.peak(problem.t_start, problem.t_stop) for wave in currents))):
-        return
-    small = ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None)
-    if small:
-        alone = f"{small} has AC alone, which drives sweeps (fingerspice ac)"
-        yield f"the sources are 0 all the time: {alone}; a sine in time is SIN(VO VA FREQ)"
-    elif not problem.initial.y.any() and not any(
-        problem.t_stop <= wave.course[0] < math.inf for wave in problem.network.waveforms
-    ):
-        yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"

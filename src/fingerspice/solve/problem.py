@@ -176,8 +176,9 @@ def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
         (span / waveform.shortest_time(), "periods or time constants", MOST_PERIODS),
         (span * waveform.breakpoint_rate(), "breakpoints", MOST_BREAKPOINTS),
     ):
-        told = f"{span:g} s long, {count:.3g} {what} of its source"
-        require(count <= most, "the run", told, f"at most {most:.0e} of them")
+        if not count <= most:
+            told = f"{span:g} s long, {count:.3g} {what} of its source"
+            raise InputError(f"the run is {told}; allowed: at most {most:.0e} of them")
 
 
 def check_outputs(circuit: Circuit, count: float) -> None:
@@ -188,9 +189,9 @@ def check_outputs(circuit: Circuit, count: float) -> None:
         return sum(of_device.get(e.device, 0) + e.spec.is_layer for e in circuit.elements) + len(nodes) + 1
 
     size = 8.0 * (signals := circuit.remember(("signals",), counted)) * count
-    told = f"one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB"
-    allowed = f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning"
-    require(size <= MOST_BYTES, "the run", told, allowed)
+    if not size <= MOST_BYTES:
+        told = f"the run is one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB; allowed: at most"
+        raise InputError(f"{told} {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning")
 
 
 def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
@@ -281,10 +282,8 @@ class Tables:
         count = max(1, int(np.ceil(span * rate)))
         # Limits (s) of the windows: short ones bound memory and the phases' round-off.
         self.edges = [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
-        # An iteration skips windows that end by this time (s), except the last window.
-        self.done = -np.inf
-        # Largest interpolation error (V) of a table that a finer table would not reduce.
-        self.rough = 0.0
+        self.done = -np.inf  # An iteration skips windows that end by this time (s), except the last window
+        self.rough = 0.0  # Largest interpolation error (V) of a table that a finer table would not reduce
         # First output time (s) at which a user's function differs from its table, the difference (V), and its number.
         self.unseen: tuple[float, float, int] | None = None
         # Time (s) at which a source stops being finite, once the iteration has reached it.

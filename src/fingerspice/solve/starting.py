@@ -35,7 +35,7 @@ from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.scenes import Scene
-from fingerspice.waveforms.waveform import DC, require
+from fingerspice.waveforms.waveform import DC
 
 
 def model_of(scene: Scene) -> Model:
@@ -97,7 +97,6 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
                 f"is another circuit's; allowed: one of this circuit, {', '.join(names)} and {scene.charge_law}"
             )
         return start.state
-    require(start in ("deck", "uncharged", "dc"), "start", repr(start), "'deck', 'uncharged', 'dc' or a Solution")
     asked = start == "deck"
 
     def make() -> State:

@@ -23,30 +23,25 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
 from fingerspice.waveforms.sampling import same_time
 
-# Runs of fewer periods are integrated throughout, because nothing would be saved.
-FEWEST_PERIODS = 6.0
+FEWEST_PERIODS = 6.0  # Runs of fewer periods are integrated throughout, because nothing would be saved
 # Number of the source's periods after which a run's error is first compared with its peaks, where ten times as many
 # are left: the tolerance was chosen before the peaks were known, and a run where it proves too large ends there.
 TRIAL_PERIODS = 2.0
-# Remaining change allowed over all later periods, as a fraction of the error allowed in a step.
-_SHARE = 1.0 / 3.0
+_SHARE = 1.0 / 3.0  # Remaining change allowed over all later periods, as a fraction of the error allowed in a step
 # Ratio of stated to estimated error: the largest error of a step may lie beside the points at which it is estimated,
 # and contributions of opposite sign may cancel at these points.
 SAFETY = 2.5
 # Error allowed in a step, relative to the error asked for: a relative error of the voltage counts twice in the force,
 # and the errors of the steps add up.
 LOCAL_SHARE = 0.15
-# Smallest error of a step above round-off, relative to the voltage scale.
-FINEST = 4e-15
+FINEST = 4e-15  # Smallest error of a step above round-off, relative to the voltage scale
 # Error allowed in a step, relative to the one before, once the voltages have settled and a period is to be repeated so
 # often that the errors of its charge add up.
 FINER = 0.01
 # Longest step, relative to the source's shortest time scale: the collocation nodes must not alias the source.
 LONGEST_STEP = 0.6
-# Parts of a run under a chirp, in each of which the longest step is that of the highest frequency there.
-PARTS = 8
-# Most steps of a period that is kept for repetition: 1 MB.
-KEPT_STEPS = 2000
+PARTS = 8  # Parts of a run under a chirp, in each of which the longest step is that of the highest frequency there
+KEPT_STEPS = 2000  # Most steps of a period that is kept for repetition: 1 MB
 
 
 class OutOfRangeError(Exception):
