@@ -192,7 +192,7 @@ def _finished(
         peak = max((float(np.abs(u).max(initial=0.0)) for u, _ in gap_signals(record)), default=0.0)
         gaps = [(peak, 0.0, rounding + bound * peak, 0.0)]
     run.gaps, run.node_error = np.array(gaps), rounding + bound * largest
-    if not problem.scene.is_sampled:
+    if not problem.network.waveform.is_sampled:
         # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
         run.continuous = closed_form(replace(problem, charge=False), again)
     return run

@@ -38,15 +38,12 @@ from fingerspice.solve.scenes import Scene
 from fingerspice.solve.starting import as_shown, from_loop, model_of, to_loop
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
 
-MOST_SYSTEMS = 16  # Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each
 # Stated error of the charge over the estimate. It comes from a stack whose layers all leak fast: compared with a
 # reference, the errors of gap voltage and charge were 1.5 times the estimates, because they peak between the points of
 # the estimate; and from scene 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
 CHARGE_SAFETY = 1.75
-MOST_SETS = 16  # Number of sets of references cached with a scene: one for each thread and decade of tolerances
 # Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
 MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
-MOST_KEPT = 16  # Number of references cached with the network, for runs with other sources
 # Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method: where
 # an area strongly affects the charge of a stiff mode, only steps of the mode's own time constant converge.
 MOST_STEPS = 100
@@ -108,8 +105,8 @@ class Track(Stepping):
             system = system_of(scene, decade, top)
             return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
 
-        # Similar runs share a system: there is one for each decade of tolerances.
-        self.system, self.area_error = scene.remember(("system", decade, top), make, MOST_SYSTEMS)
+        # Similar runs share a system: there is one for each decade of tolerances, of up to 1 MB.
+        self.system, self.area_error = scene.remember(("system", decade, top), make)
         model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
         self.capacitance = float(model.slow[-3]) * model.area0  # Of the layer through which the charge is computed
@@ -206,13 +203,9 @@ class Known:
         }  # fmt: skip
         self.add(scene, (0,) * n_area)
 
-    @property
-    def count(self) -> int:
-        return int(self.arrays.used[0])
-
     def add(self, scene: Scene, levels: tuple[int, ...]) -> None:
         """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
-        arrays, one = self.arrays, self.count
+        arrays, one = self.arrays, int(self.arrays.used[0])
         if one == len(arrays.levels):
             more = {"levels": np.zeros_like(arrays.levels), "numbers": np.zeros_like(arrays.numbers)}
             self.arrays = arrays = arrays._replace(**{k: np.append(getattr(arrays, k), x, 0) for k, x in more.items()})
@@ -225,7 +218,7 @@ class Known:
     @staticmethod
     def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
         key = ("referred", scene.fixed, area.tobytes())
-        return scene.network.remember(key, lambda: _refer(scene, area), MOST_KEPT)
+        return scene.network.remember(key, lambda: _refer(scene, area))
 
     def form(self) -> Form:
         """A form for the areas at 0 V, with its own copy of the numbers: compiled code overwrites them."""
@@ -241,7 +234,7 @@ def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
     key = ("references", decade, threading.get_ident())
     if anew:
         scene.kept.pop(key, None)
-    return scene.remember(key, lambda: Known(scene, decade), MOST_SETS)
+    return scene.remember(key, lambda: Known(scene, decade))
 
 
 def _fed(scene: Scene) -> IntArray:
@@ -344,13 +337,13 @@ class March(Stepping):
             # Add the reference areas that the compiled loop needs next, and that it has written to `wanted`.
             scene, known, at = self.problem.scene, self.references, self.work.at
             wanted = tuple(map(int, known.arrays.wanted))
-            if known.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
+            if known.arrays.used[0] >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
                 # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
                 levels = tuple(map(int, known.arrays.levels[at[0]]))
                 self.references = known = known_references(scene, self.decade, anew=True)
                 if any(levels):
                     known.add(scene, levels)
-                at[0] = known.count - 1
+                at[0] = known.arrays.used[0] - 1
                 self.work.own.keys[:] = self.work.own.key[:] = -1
             known.add(scene, wanted)
         return code
@@ -374,8 +367,13 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     With `repeat`, later periods may repeat one period, once the state no longer changes from one to the next.
     """
     tables = Tables(problem, LOCAL_SHARE * rtol)
-    is_stack = problem.network.stack is not None
-    met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
+    is_stack, met, wave = problem.network.stack is not None, 0.0, problem.network.waveform
+    if wave.is_sampled:
+        # Also between the samples that a scene knows.
+        voltages = (table for window in tables for table in window[: problem.network.n_voltage])
+        met = max((table.scale for table in voltages), default=0.0) or problem.scene.u_peak
+    elif is_stack:
+        met = problem.scene.u_peak or wave.peak(problem.t_start, problem.t_stop)
     if is_stack:
         # The largest gap voltage to expect.
         u_scale = max(met * model_of(problem.scene).k_gap if met < math.inf else 0.0, problem.stored) or GUESS

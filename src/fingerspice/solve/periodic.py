@@ -82,7 +82,10 @@ class Period:
         self.parts = 2 if _turns(problem) and not pushed and not np.any(self.kept) else 1
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
-        key, end = ("period", self.begin, self.span, problem.step if scene.is_sampled else 0.0), self.begin + self.span
+        key, end = (
+            ("period", self.begin, self.span, problem.step if waveform.is_sampled else 0.0),
+            self.begin + self.span,
+        )
         self.tables = scene.remember(key, lambda: [
             source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.network.waveforms
         ], MOST_PERIODS)  # fmt: skip

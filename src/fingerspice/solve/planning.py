@@ -25,7 +25,6 @@ from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DOUBLE, refuse, require
 
-MOST_PLANS = 16  # Number of plans cached with a scene
 TIERS = ("algebraic", "linear", "coupled")
 # A scene is called stiff if its fastest rate times the source's shortest time exceeds this: stability alone would then
 # limit the steps of an explicit method.
@@ -57,7 +56,7 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
     refuse(tier not in ("auto", *TIERS), f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
     asked = "coupled" if tier == "auto" and method != "auto" else tier
     key = ("plan", rtol, asked, problem.start, problem.charge, problem.stored, problem.t_start, problem.t_stop)
-    return problem.scene.remember(key, lambda: _plan(problem, rtol, asked), MOST_PLANS)
+    return problem.scene.remember(key, lambda: _plan(problem, rtol, asked))
 
 
 def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
@@ -87,7 +86,7 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
         needed += error
     elif scene.network.stack is not None and problem.circuit.by_device("SKIN_DISPERSIVE"):
         reasons.append(f"skin dispersive: no one frequency serves to rtol = {rtol:g}")
-    if scene.is_sampled:
+    if problem.network.waveform.is_sampled:
         event = format_si(shortest_event(problem), "s")
         reasons.append(f"a source is a function: an event in it shorter than {event} may be missed without breaks=")
     found = tuple(sorted(map(float, rates)))

@@ -276,7 +276,7 @@ class Tables:
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
         span, wave = problem.t_stop - problem.t_start, problem.network.waveform
         # A function is sampled at the output step.
-        longest = 4096.0 * problem.step if problem.scene.is_sampled else math.inf
+        longest = 4096.0 * problem.step if wave.is_sampled else math.inf
         longest = min(longest, PERIODS_PER_WINDOW * wave.shortest_time())
         rate = max(wave.breakpoint_rate() / BREAKPOINTS_PER_WINDOW, 1.0 / longest)
         count = max(1, int(np.ceil(span * rate)))
@@ -292,8 +292,8 @@ class Tables:
         # rises out of next to nothing would be followed there beyond its own digits.
         peaks = [wave.kept.get("peak", (None, 0.0))[1] for wave in problem.network.waveforms]
         self.scales = [peak if np.isfinite(peak) else 0.0 for peak in peaks]
-        few = problem.network.waveform if len(self.edges) <= 1 + KEPT_WINDOWS else None
-        self.keeper: Remembering | None = Remembering() if problem.scene.is_sampled else few
+        few = wave if len(self.edges) <= 1 + KEPT_WINDOWS else None
+        self.keeper: Remembering | None = Remembering() if wave.is_sampled else few
 
     def __iter__(self) -> Iterator[list[SourceTable]]:
         for w0, w1 in itertools.pairwise(self.edges):
@@ -320,14 +320,6 @@ class Tables:
                 self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
             tables.append(table)
         return tables
-
-    def peak(self) -> float:
-        """Largest source voltage (V) of the run; of users' functions also between the samples that a scene knows."""
-        problem = self.problem
-        if not problem.scene.is_sampled:
-            return problem.scene.u_peak or problem.network.waveform.peak(problem.t_start, problem.t_stop)
-        met = (table.scale for tables in self for table in tables[: problem.network.n_voltage])
-        return max(met, default=0.0) or problem.scene.u_peak
 
 
 def shortest_event(problem: Problem) -> float:

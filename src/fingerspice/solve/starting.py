@@ -156,9 +156,9 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
     if stack is not None:
         of: dict[str, list[float]] = {}
         for layer, count in zip(stack.layers, stack.cells, strict=True):
-            own = [v for cell, v in zip(network.cells, u.tolist(), strict=True) if cell.element is layer]
+            each = [v for cell, v in zip(network.cells, u.tolist(), strict=True) if cell.element is layer]
             # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
-            of[layer.name] = own if count > 1 else [sum(own)]
+            of[layer.name] = each if count > 1 else [sum(each)]
         u = np.array([of[cell.element.name].pop(0) for cell in scene.network.cells])
     for place in np.flatnonzero(held & (net.slow < 0)) if net.mobile else ():
         # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
