@@ -155,9 +155,9 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
     key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
     yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
-    waves, currents = problem.network.waveforms, problem.network.waveforms[problem.network.n_voltage :]
-    off = success and waves and not run.gaps[:, 0].any() and problem.scene.u_peak == 0.0
-    if off and not any(wave.peak(problem.t_start, problem.t_stop) for wave in currents):
+    waves = problem.network.waveforms
+    off = problem.scene.u_peak == 0.0 and success and waves and not run.gaps[:, 0].any()
+    if off and not any(wave.peak(problem.t_start, problem.t_stop) for wave in waves[problem.network.n_voltage :]):
         if small := ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None):
             alone = f"{small} has AC alone, which drives sweeps (fingerspice ac)"
             yield f"the sources are 0 all the time: {alone}; a sine in time is SIN(VO VA FREQ)"

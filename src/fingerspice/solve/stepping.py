@@ -58,6 +58,7 @@ class Stepping(Integration):
     capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
     charge_safety = 1.0  # Stated error of the charge over the estimate
     rates: FloatArray  # Decay rates of the modes, among them those at 0 V, 1/s
+    looks = loop.no_looks()  # Those of a run that `look` does not prepare
     fresh: list[Any] | None = None  # What an integration that begins `again` sets its arrays to
 
     def __init__(self, problem: Problem, tol: float, shown: int, width: int) -> None:
@@ -79,7 +80,6 @@ class Stepping(Integration):
         self.outputs = Outputs(self.t_out, self.left, self.out)
         self.repeated = 0  # Number of periods that were not integrated but repeat another
         self.recorder = Recorder(shown)
-        self.looks = loop.no_looks()
         self.keep(0)
 
     def look(self, asked: float, repeat: bool) -> None:
@@ -97,7 +97,8 @@ class Stepping(Integration):
         if asked < math.inf and periods >= 1.0 + 10.0 * TRIAL_PERIODS:
             values[loop.TRIAL] = start + TRIAL_PERIODS * self.period
             values[loop.ACCEPTABLE] = asked / SAFETY
-        scale = np.append(np.ones(self.n), np.full(self.n_slow, self.largest))
+        scale = np.ones(self.n + self.n_slow)
+        scale[self.n :] = self.largest
         self.looks = Looks(values, np.zeros(scale.size), scale)
 
     def again(self, initial: State, tol: float) -> None:
