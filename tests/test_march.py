@@ -32,7 +32,7 @@ def errors_of_one_step(amplitude: float, offset: float, phase: float, h: float, 
     exact = ref.transient(ref.sine_segments(amplitude, F, h, phase=phase, offset=offset), t[:-1], freq=F, law=law)
     u = np.vstack([exact.u, exact.at([h], side="left").u])
     problem = problem.at(t, left)
-    one = Track(problem, 1e-13, 1e-13, repeat=False)
+    one = Track(problem, 1e-13, 1e-13)
     one.pace = one.pace._replace(h_max=h, controlled=False)
     run = integrate(one, Tables(problem, 1e-13))
     assert run.stats["steps"] == 1

@@ -1,5 +1,6 @@
 """Every method on every circuit: the package's own steppers, and scipy's and torchdiffeq's on one right-hand side."""
 
+import pickle
 import re
 from functools import lru_cache
 
@@ -136,6 +137,12 @@ def test_a_run_goes_on_from_one_by_another_method(first, law):
             for name in ("u_gap", "q_source"):
                 theirs, ours = getattr(whole, name)[late][smooth], getattr(two, name)[smooth]
                 assert np.abs(ours - theirs).max() <= 1e-7 * np.abs(getattr(whole, name)).max(), (stop, second, name)
+
+
+@pytest.mark.parametrize("method", ["radau", "scipy:DOP853"])
+def test_a_run_travels_with_what_it_is_between_its_outputs(method):
+    run = fs.simulate(table1(), t_stop=1e-4, rtol=1e-4, method=method)
+    assert pickle.loads(pickle.dumps(run)).f_el_mean == run.f_el_mean
 
 
 def test_an_explicit_method_of_torchdiffeq_that_gives_up_is_explained(monkeypatch):

@@ -71,7 +71,7 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     run.t_failed, run.unseen, run.rough = tables.not_finite, tables.unseen, tables.rough
     run.charge_error = charge_error
     _state_errors(problem, run, bound)
-    if not scene.is_sampled:
+    if not problem.network.waveform.is_sampled:
         # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
         again = partial(solve_linear, area=None if at_once else area)
         run.continuous = closed_form(replace(problem, charge=False), again)

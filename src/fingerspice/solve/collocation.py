@@ -38,25 +38,17 @@ from fingerspice.solve.scenes import Scene
 from fingerspice.solve.starting import as_shown, from_loop, model_of, to_loop
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
 
-# Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each.
-MOST_SYSTEMS = 16
 # Stated error of the charge over the estimate. It comes from a stack whose layers all leak fast: compared with a
 # reference, the errors of gap voltage and charge were 1.5 times the estimates, because they peak between the points of
 # the estimate; and from scene 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
 CHARGE_SAFETY = 1.75
-# Number of sets of references cached with a scene: one for each thread and decade of tolerances.
-MOST_SETS = 16
 # Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
 MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
-# Number of references cached with the network, for runs with other sources.
-MOST_KEPT = 16
-# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method. Where
-# an area strongly affects the charge of a stiff mode, the fixed-point iteration converges only with steps of the
-# mode's own time constant.
+# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method: where
+# an area strongly affects the charge of a stiff mode, only steps of the mode's own time constant converge.
 MOST_STEPS = 100
 ATTEMPTS = 6
-# Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.
-GUESS = 1.0
+GUESS = 1.0  # Voltage scale of a circuit whose sources give none, before any voltage has been computed, V
 
 
 class _Scratch(threading.local):
@@ -106,24 +98,22 @@ class Track(Stepping):
     The error of the gap voltage is at most `tol` (V) in every step; its area's curve reaches `top` (V) if not 0.
     """
 
-    def __init__(self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True) -> None:
+    def __init__(self, problem: Problem, rtol: float, tol: float, top: float = 0.0) -> None:
         scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
 
         def make() -> tuple[System, float]:
             system = system_of(scene, decade, top)
             return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
 
-        # Similar runs share a system: there is one for each decade of tolerances.
-        self.system, self.area_error = scene.remember(("system", decade, top), make, MOST_SYSTEMS)
+        # Similar runs share a system: there is one for each decade of tolerances, of up to 1 MB.
+        self.system, self.area_error = scene.remember(("system", decade, top), make)
         model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
-        # Of the layer through which the charge is computed.
-        self.capacitance = float(model.slow[-3]) * model.area0
+        self.capacitance = float(model.slow[-3]) * model.area0  # Of the layer through which the charge is computed
         super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown)
-        self.error = np.zeros(n + 1)
+        self.rates, self.error = self.system.rates, np.zeros(n + 1)
         self.control["branch_length"], self.control["margin"] = np.inf, 1.0
         self.load(problem.initial)
-        self.look_for_period(self.system.rates, np.ones(n), repeat)
 
     def load(self, initial: State) -> None:
         super().load(initial)
@@ -213,13 +203,9 @@ class Known:
         }  # fmt: skip
         self.add(scene, (0,) * n_area)
 
-    @property
-    def count(self) -> int:
-        return int(self.arrays.used[0])
-
     def add(self, scene: Scene, levels: tuple[int, ...]) -> None:
         """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
-        arrays, one = self.arrays, self.count
+        arrays, one = self.arrays, int(self.arrays.used[0])
         if one == len(arrays.levels):
             more = {"levels": np.zeros_like(arrays.levels), "numbers": np.zeros_like(arrays.numbers)}
             self.arrays = arrays = arrays._replace(**{k: np.append(getattr(arrays, k), x, 0) for k, x in more.items()})
@@ -232,7 +218,7 @@ class Known:
     @staticmethod
     def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
         key = ("referred", scene.fixed, area.tobytes())
-        return scene.network.remember(key, lambda: _refer(scene, area), MOST_KEPT)
+        return scene.network.remember(key, lambda: _refer(scene, area))
 
     def form(self) -> Form:
         """A form for the areas at 0 V, with its own copy of the numbers: compiled code overwrites them."""
@@ -248,7 +234,7 @@ def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
     key = ("references", decade, threading.get_ident())
     if anew:
         scene.kept.pop(key, None)
-    return scene.remember(key, lambda: Known(scene, decade), MOST_SETS)
+    return scene.remember(key, lambda: Known(scene, decade))
 
 
 def _fed(scene: Scene) -> IntArray:
@@ -308,7 +294,7 @@ def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list
 class March(Stepping):
     """One integration of a network, with an error of at most `tol` times `u_scale` (V) in every step."""
 
-    def __init__(self, problem: Problem, rtol: float, tol: float, u_scale: float, repeat: bool) -> None:
+    def __init__(self, problem: Problem, rtol: float, tol: float, u_scale: float) -> None:
         scene, size = problem.scene, problem.initial.y.size
         n_s, n_area = len(scene.network.waveforms), scene.net.gap.size
         self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
@@ -322,10 +308,8 @@ class March(Stepping):
         self.shortest = problem.network.waveform.shortest_time()
         self.references = known_references(scene, self.decade)
         self.form = self.references.form()
-        self.held, cells = held(self.form), self.form.c.size
+        self.rates, self.held, cells = self.form.rates, held(self.form), self.form.c.size
         self.work = new_network_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
-        scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
-        self.look_for_period(self.form.rates, scale, repeat)
 
     @property
     def rounding(self) -> list[float]:
@@ -350,33 +334,30 @@ class March(Stepping):
         more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
         self.step[0]["most"] = taken + int(more)
         while (code := super().march(sources, t_end, looks)) == readout.REFERENCE:
-            self._add_reference()
+            # Add the reference areas that the compiled loop needs next, and that it has written to `wanted`.
+            scene, known, at = self.problem.scene, self.references, self.work.at
+            wanted = tuple(map(int, known.arrays.wanted))
+            if known.arrays.used[0] >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
+                # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
+                levels = tuple(map(int, known.arrays.levels[at[0]]))
+                self.references = known = known_references(scene, self.decade, anew=True)
+                if any(levels):
+                    known.add(scene, levels)
+                at[0] = known.arrays.used[0] - 1
+                self.work.own.keys[:] = self.work.own.key[:] = -1
+            known.add(scene, wanted)
         return code
 
     def jump(self, after: FloatArray) -> bool:
         # With sources that stay at these values.
         return self.march(ramp(after, after, self.t), self.t, no_looks()) == readout.DONE
 
-    def _add_reference(self) -> None:
-        """Add the reference areas that the compiled loop needs next, and that it has written to `wanted`."""
-        known, at = self.references, self.work.at
-        wanted = tuple(map(int, known.arrays.wanted))
-        if known.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
-            # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
-            levels = tuple(map(int, known.arrays.levels[at[0]]))
-            self.references = known = known_references(self.problem.scene, self.decade, anew=True)
-            if levels != (0,) * len(levels):
-                known.add(self.problem.scene, levels)
-            at[0] = known.count - 1
-            self.work.own.keys[:] = self.work.own.key[:] = -1
-        known.add(self.problem.scene, wanted)
 
-
-def stepping(problem: Problem, rtol: float, tol: float, u_scale: float, top: float, repeat: bool) -> Track | March:
+def stepping(problem: Problem, rtol: float, tol: float, u_scale: float, top: float) -> Track | March:
     """An integration with an error of `tol` times `u_scale` (V) in every step; for `top` see `Track`."""
     if problem.network.stack is None:
-        return March(problem, rtol, tol, u_scale, repeat)
-    return Track(problem, rtol, tol * u_scale, top, repeat)
+        return March(problem, rtol, tol, u_scale)
+    return Track(problem, rtol, tol * u_scale, top)
 
 
 def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, repeat: bool = True) -> Run:
@@ -386,8 +367,13 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     With `repeat`, later periods may repeat one period, once the state no longer changes from one to the next.
     """
     tables = Tables(problem, LOCAL_SHARE * rtol)
-    is_stack = problem.network.stack is not None
-    met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
+    is_stack, met, wave = problem.network.stack is not None, 0.0, problem.network.waveform
+    if wave.is_sampled:
+        # Also between the samples that a scene knows.
+        voltages = (table for window in tables for table in window[: problem.network.n_voltage])
+        met = max((table.scale for table in voltages), default=0.0) or problem.scene.u_peak
+    elif is_stack:
+        met = problem.scene.u_peak or wave.peak(problem.t_start, problem.t_stop)
     if is_stack:
         # The largest gap voltage to expect.
         u_scale = max(met * model_of(problem.scene).k_gap if met < math.inf else 0.0, problem.stored) or GUESS
@@ -397,9 +383,8 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     # What is left of sources that cancel has fewer digits than these; what a gap takes of a source has as many as that.
     finest = FINEST * max(1.0, problem.scene.u_size / (met or u_scale))
     while True:
-        one = stepping(problem, rtol, max(tol, finest), u_scale, top, repeat)
-        if tries_out:
-            one.try_out(rtol)
+        one = stepping(problem, rtol, max(tol, finest), u_scale, top)
+        one.look(rtol if tries_out else math.inf, repeat)
         try:
             run = integrate(one, tables, progress)
         except OutOfRangeError as error:
@@ -408,12 +393,10 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
         run.by_layer = True
         run.end_where_it_stopped()
         run.nfev = nfev = nfev + run.nfev
-        run.stats["repeated"] = one.repeated
-        run.continuous = one.recorded()
         one.stated(run)
         attempts += 1
         worst = excess_of(run.gaps, problem.rounding) / rtol
-        # A trial (`try_out`) that predicts too large an error stops the run early, with ERROR_NOT_MET.
+        # An early judgement that predicts too large an error stops the run, with ERROR_NOT_MET.
         is_whole = run.status is not Status.ERROR_NOT_MET
         if is_whole and (run.status is not Status.SUCCESS or worst <= 1.0):
             return run

@@ -41,8 +41,7 @@ LOCAL_SHARE, FINEST, ROUNDED = 0.2, 1e-14, 4e-15
 PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 # They are also compared after at most so many edges of the sources, at these fractions of the time to the next edge.
 MOST_EDGES, AFTER_EDGE = 256, np.geomspace(1e-15, 0.3, 30)
-# Number of attempts, and time after which the expected time of a run is announced, s.
-ATTEMPTS, TELL_AFTER = 6, 3.0
+ATTEMPTS, TELL_AFTER = 6, 3.0  # Number of attempts, and time after which the expected time of a run is announced, s
 # Difference of a fold's times in two successive runs at which the fold is accepted at once, over its time; and the one
 # at which it is accepted after the last attempt, over its time or the source's shortest time, if that is longer.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
@@ -144,8 +143,11 @@ def _schemes(problem: Problem) -> tuple[Scheme, Scheme]:
     return radau_scheme(STAGES_BESIDE)._replace(h_max=longest), radau_scheme(STAGES)._replace(h_max=longest)
 
 
-def _integrate(problem: Problem, scheme: Scheme, tol: float, u_scale: float, progress: Progress | None = None) -> Run:
-    one = Collocation(problem, scheme, tol, u_scale, progress)
+def _integrate(
+    problem: Problem, method: Scheme | str, tol: float, u_scale: float, progress: Progress | None = None
+) -> Run:
+    kind: Any = Foreign if isinstance(method, str) else Collocation
+    one: Collocation = kind(problem, method, tol, u_scale, progress)
     run = integrate(one, Tables(problem, tol), progress)
     run.gaps = one.met
     return run
@@ -205,7 +207,7 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
     run = run.only(~probed)
     run.end_where_it_stopped()
     run.margin = min(margin, float(run.record(problem).fold_margin[-1])) if mobile and run.t.size else margin
-    again = partial(_integrate, scheme=fine, tol=taken, u_scale=u_scale)
+    again = partial(_integrate, method=fine, tol=taken, u_scale=u_scale)
     run.continuous = closed_form(problem, again, _BETWEEN * excess_of(run.gaps, problem.rounding))
     run.note = f"{reason}; implicit steps took over, {run.stats['steps']} of them" if reason else ""
     return run
@@ -270,17 +272,14 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
 
     Returns the largest stated error relative to the peak of its gap, of voltages and forces.
     """
-    both, gaps = (alike + ROUNDED) * u_scale, []
-    fine, coarse = probed.record(problem), beside.record(problem)
+    gaps, fine, coarse = [], probed.record(problem), beside.record(problem)
     # Between the times compared, the steps may have seen larger voltages, and forces if the area has no time constant.
     met = itertools.chain(run.gaps[:, :2].tolist(), itertools.repeat((0.0, 0.0)))
     for (u, f), (v, g), (u_met, f_met) in zip(gap_signals(fine), gap_signals(coarse), met, strict=False):
         peak, force = max(float(np.abs(u).max(initial=0.0)), u_met), max(float(f.max(initial=0.0)), f_met)
-        # F ~ u^2: an error du of u is an error 2 F du / u of F.
-        moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
-        gaps.append((peak, force, apart(u, v) + both, apart(f, g) + moved))
-    run.gaps = np.array(gaps).reshape(-1, 4)
-    run.node_error = runs.nodes_apart(fine, coarse) + both
+        gaps.append((peak, force, apart(u, v), apart(f, g)))
+    run.gaps, run.node_error = np.array(gaps).reshape(-1, 4), runs.nodes_apart(fine, coarse)
+    run.add_error((alike + ROUNDED) * u_scale)
     if problem.charge:
         at = slice(problem.initial.y.size - problem.initial.s_before.size, problem.initial.y.size)
         run.charge_error = apart(probed.rows[:, at], beside.rows[:, at])
@@ -303,8 +302,8 @@ class _FailedError(Exception):
 class Foreign(Collocation):
     """One integration by a library, from edge to edge of the sources; jumps are integrated as in `Collocation`."""
 
-    def __init__(self, problem: Problem, method: str, tol: float, u_scale: float) -> None:
-        super().__init__(problem, radau_scheme(STAGES), tol, u_scale)
+    def __init__(self, problem: Problem, method: str, tol: float, u_scale: float, progress: Progress | None) -> None:
+        super().__init__(problem, radau_scheme(STAGES), tol, u_scale, progress)
         self.library, _, self.name = method.partition(":")
         # Without a request for charge its scale is infinite, which libraries cannot take: 1 C is as good as infinite.
         self.scale = np.where(np.isfinite(self.scale), self.scale, 1.0)
@@ -407,12 +406,8 @@ def solve_foreign(problem: Problem, method: str, rtol: float, progress: Progress
     reference = solve_coupled(problem, max(REFERENCE * rtol, 1e-13))
     ours, u_scale = reference.record(problem), float(reference.gaps[:, 0].max(initial=0.0)) or 1.0
     tol, nfev = FIRST * rtol, 0
-
-    def once(other: Problem, tol: float, progress: Progress | None = None) -> Run:
-        return integrate(Foreign(other, method, tol, u_scale), Tables(other, tol), progress)
-
     for _ in range(ATTEMPTS):
-        run = once(problem, tol, progress)
+        run = _integrate(problem, method, tol, u_scale, progress)
         theirs, nfev = run.record(problem), nfev + run.nfev
         run.nfev, run.margin, run.gaps = nfev, reference.margin, reference.gaps.copy()
         for gap, mine, other in zip(run.gaps, gap_signals(ours), gap_signals(theirs), strict=True):
@@ -424,7 +419,8 @@ def solve_foreign(problem: Problem, method: str, rtol: float, progress: Progress
                 run.status, run.t_failed = reference.status, reference.t_failed
             return run
         if worst <= 1.0:
-            run.continuous = closed_form(problem, partial(once, tol=tol), rtol)
+            again = partial(_integrate, method=method, tol=tol, u_scale=u_scale)
+            run.continuous = closed_form(problem, again, rtol)
             return run
         tol = max(tol * min(0.3, 0.5 / worst), 1e-16)
     run.status = Status.ERROR_NOT_MET

@@ -82,7 +82,8 @@ class Period:
         self.parts = 2 if _turns(problem) and not pushed and not np.any(self.kept) else 1
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
-        key, end = ("period", self.begin, self.span, problem.step if scene.is_sampled else 0.0), self.begin + self.span
+        key = "period", self.begin, self.span, problem.step if waveform.is_sampled else 0.0
+        end = self.begin + self.span
         self.tables = scene.remember(key, lambda: [
             source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.network.waveforms
         ], MOST_PERIODS)  # fmt: skip
@@ -279,7 +280,7 @@ class Search(Period):
         """One pass by exponential steps; None where they fail before the end."""
         while True:
             if self.one is None:
-                self.one = stepping(self.problem, self.rtol, tol, self.scale, self.top, False)
+                self.one = stepping(self.problem, self.rtol, tol, self.scale, self.top)
             one = self.one
             one.again(initial, tol * self.scale)
             try:

@@ -15,7 +15,6 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import circuit_warnings, course_warnings, spectrum_warning
 from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.statespace import driving
-from fingerspice.engine.one_area.model import Model
 from fingerspice.physics.contact import inverse_area, inverse_area_range
 from fingerspice.results.outcome import Plan, Status
 from fingerspice.results.record import Record
@@ -26,16 +25,13 @@ from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DOUBLE, refuse, require
 
-# Number of plans cached with a scene.
-MOST_PLANS = 16
 TIERS = ("algebraic", "linear", "coupled")
 # A scene is called stiff if its fastest rate times the source's shortest time exceeds this: stability alone would then
 # limit the steps of an explicit method.
 STIFF = 300.0
 REPEATS = "periodic: once a period no longer changes the state, later ones repeat it"
 BREAKDOWN_VOLTAGE = 300.0
-# Smallest contact area without a warning, relative to the area at 0 V.
-LEAST_AREA = 0.2
+LEAST_AREA = 0.2  # Smallest contact area without a warning, relative to the area at 0 V
 # Smallest distance to the fold of the mobile law without a warning: a voltage a few percent larger reaches the fold.
 NEAR_FOLD = 0.2
 # Shortest event (s) in a user's function that may be missed without a warning, half a period of 10 kHz: drives of a
@@ -60,21 +56,17 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
     refuse(tier not in ("auto", *TIERS), f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
     asked = "coupled" if tier == "auto" and method != "auto" else tier
     key = ("plan", rtol, asked, problem.start, problem.charge, problem.stored, problem.t_start, problem.t_stop)
-    return problem.scene.remember(key, lambda: _plan(problem, rtol, asked), MOST_PLANS)
+    return problem.scene.remember(key, lambda: _plan(problem, rtol, asked))
 
 
 def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     scene, model, span = problem.scene, problem.scene.model, problem.t_stop - problem.t_start
-    if model is None:
-        changed, area = math.nan, float(scene.net.area0[0]) if problem.network.areas else math.nan
-        if not scene.coupled:
-            changed = 0.0
-        elif len(problem.network.sources) == problem.network.n_voltage:
-            changed = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
-        best, reason = _of_network(problem, changed)
-    else:
-        changed, area = _change(model.curve, scene.u_peak) if model.coupled else (0.0, model.area0)
-        best, reason = _of_stack(problem, model, rtol, changed)
+    area, changed = float(scene.net.area0[0]) if scene.fixed else math.nan, math.nan if scene.coupled else 0.0
+    if model is not None and model.coupled:
+        changed, area = _change(model.curve, scene.u_peak)
+    elif scene.coupled and len(problem.network.sources) == problem.network.n_voltage:
+        changed = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
+    best, reason = _best(problem, rtol, changed)
     chosen = best if tier == "auto" else tier
     if chosen != best:
         _refuse(problem, chosen, best)
@@ -94,7 +86,7 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
         needed += error
     elif scene.network.stack is not None and problem.circuit.by_device("SKIN_DISPERSIVE"):
         reasons.append(f"skin dispersive: no one frequency serves to rtol = {rtol:g}")
-    if scene.is_sampled:
+    if problem.network.waveform.is_sampled:
         event = format_si(shortest_event(problem), "s")
         reasons.append(f"a source is a function: an event in it shorter than {event} may be missed without breaks=")
     found = tuple(sorted(map(float, rates)))
@@ -116,30 +108,24 @@ def _refuse(problem: Problem, tier: str, best: str) -> None:
         raise InputError(f"the linear tier takes the area as fixed, and {what} needs the one that follows the voltage")
 
 
-def _of_network(problem: Problem, changed: float) -> tuple[str, str]:
-    """The tier of a network, and the reason: linear where its areas are fixed, else coupled.
+def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
+    """The lightest tier that is valid, and the reason.
 
     With capacitors outside the layers, a small change of an area may have a large effect on the voltages over many
     periods. No useful bound of that effect is known beforehand: a network is coupled however little its areas change.
     """
-    scene, network = problem.scene, problem.network
-    if not scene.coupled:
-        which = f"the areas are {scene.area_mode}" if network.areas else "no element has an area"
-        return "linear", f"{which}, so the circuit is linear"
-    several = len(network.fingers) > 1
-    follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
-    if math.isnan(changed):
-        return "coupled", f"{follows}; by how much is not known beforehand: a current source sets no bound"
-    return "coupled", f"{follows}, {'each ' if several else ''}by up to {_percent(changed)} of its middle"
-
-
-def _of_stack(problem: Problem, model: Model, rtol: float, changed: float) -> tuple[str, str]:
-    """The tier of a stack, the lightest of all three that is valid, and the reason."""
-    leaks = model.rate.any() or model.rate0.any()
-    if not leaks and not (model.mobile and model.coupled and problem.stored > 0.0):
+    scene, model, several = problem.scene, problem.scene.model, len(problem.network.fingers) > 1
+    stores = scene.coupled and model is not None and model.mobile and problem.stored > 0.0
+    if model is not None and not (model.rate.any() or model.rate0.any() or stores):
         return "algebraic", "no layer leaks, so the voltages follow the source at once"
-    if not model.coupled:
-        return "linear", f"the area is {problem.scene.area_mode}, so the circuit is linear"
+    if not scene.coupled:
+        which = f"the area{' is' if model is not None else 's are'} {scene.area_mode}"
+        return "linear", f"{which if scene.fixed else 'no element has an area'}, so the circuit is linear"
+    if model is None:
+        follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
+        if math.isnan(changed):
+            return "coupled", f"{follows}; by how much is not known beforehand: a current source sets no bound"
+        return "coupled", f"{follows}, {'each ' if several else ''}by up to {_percent(changed)} of its middle"
     free = not model.rate0.any()
     if model.mobile or not (free or changed <= 0.2 * rtol):
         return "coupled", f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
@@ -165,18 +151,30 @@ def _change(curve: FloatArray, u_peak: float) -> tuple[float, float]:
 
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Warnings for every limit of the model that the run exceeds."""
-    success, several = run.status is Status.SUCCESS, len(record.fingers) > 1
+    success, several, net = run.status is Status.SUCCESS, len(record.fingers) > 1, problem.scene.net
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
     key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
     yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
-    if success and problem.network.waveforms and not run.gaps[:, 0].any():
-        yield from _off_warning(problem)
+    waves = problem.network.waveforms
+    off = problem.scene.u_peak == 0.0 and success and waves and not run.gaps[:, 0].any()
+    if off and not any(wave.peak(problem.t_start, problem.t_stop) for wave in waves[problem.network.n_voltage :]):
+        if small := ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None):
+            alone = f"{small} has AC alone, which drives sweeps (fingerspice ac)"
+            yield f"the sources are 0 all the time: {alone}; a sine in time is SIN(VO VA FREQ)"
+        elif not problem.initial.y.any() and not any(problem.t_stop <= wave.course[0] < math.inf for wave in waves):
+            yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"
     if run.note and success:
         yield run.note
     for finger, (name, contact) in enumerate(record.fingers):
         u_peak, f_peak, u_error, _ = run.gaps[finger].tolist()
-        where, unloaded = f" of {name}" if several else "", record.net.area0[problem.network.fingers[finger]]
-        least, largest = _areas_met(problem, record, finger, u_peak)
+        where, i = f" of {name}" if several else "", problem.network.fingers[finger]
+        unloaded = least = largest = float(net.area0[i])
+        if net.slow[i] >= 0:
+            area = record.each("area")[finger]
+            least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
+        elif net.gap[i] >= 0:
+            least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
+            largest = max(unloaded, least)
         if u_peak > BREAKDOWN_VOLTAGE:
             limit = f"air breaks down above about {BREAKDOWN_VOLTAGE:g} V (Paschen minimum 327 V)"
             yield f"the gap voltage{where} reaches {u_peak:.4g} V; {limit}, which the model does not contain"
@@ -205,19 +203,6 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
                 yield f"{met}; its dielectric strength is {strength:.3g} V/m"
 
 
-def _areas_met(problem: Problem, record: Record, finger: int, u_peak: float) -> tuple[float, float]:
-    """Least area of a finger in the run, infinite where it is fixed, and the largest that its stress acts on, m^2."""
-    net, i = problem.scene.net, problem.network.fingers[finger]
-    unloaded = float(net.area0[i])
-    if net.slow[i] >= 0:
-        area = record.each("area")[finger]
-        return float(area.min(initial=math.inf)), float(area.max(initial=0.0))
-    if net.gap[i] < 0:
-        return math.inf, unloaded
-    least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
-    return least, max(unloaded, least)
-
-
 def _source_warnings(problem: Problem) -> Iterator[str]:
     """Warnings about sources that miss the run, and about sources beyond the band of the skin's data."""
     yield from course_warnings(problem.circuit, problem.t_start, problem.t_stop, problem.by_deck)
@@ -228,18 +213,3 @@ def _source_warnings(problem: Problem) -> Iterator[str]:
         mend = "give Function(f, breaks=(...)) its edges, or the circuit a .tran of a shorter TSTEP"
         yield f"the source is a function, {seen}; {mend}"
     yield from spectrum_warning(problem.circuit, problem.network.waveform, problem.t_stop)
-
-
-def _off_warning(problem: Problem) -> Iterator[str]:
-    """A warning about sources that are 0 in the whole run, unless a charge of the start drives it."""
-    currents = problem.network.waveforms[problem.network.n_voltage :]
-    if any((problem.scene.u_peak, *(wave.peak(problem.t_start, problem.t_stop) for wave in currents))):
-        return
-    small = ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None)
-    if small:
-        alone = f"{small} has AC alone, which drives sweeps (fingerspice ac)"
-        yield f"the sources are 0 all the time: {alone}; a sine in time is SIN(VO VA FREQ)"
-    elif not problem.initial.y.any() and not any(
-        problem.t_stop <= wave.course[0] < math.inf for wave in problem.network.waveforms
-    ):
-        yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"

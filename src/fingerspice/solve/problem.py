@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, Remembering, real_number
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, Remembering, read_only, real_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import area_given, time_slip
@@ -27,7 +27,7 @@ from fingerspice.solve.starting import initial_state, to_loop
 from fingerspice.waveforms import sampling
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, same_time, source_table
-from fingerspice.waveforms.waveform import DC, Waveform, require
+from fingerspice.waveforms.waveform import DC, Waveform, refuse, require
 
 #: Most periods (or shortest time scales) of the source in a run, and most breakpoints: they take hours and a gigabyte.
 MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9
@@ -140,8 +140,8 @@ def prepare(
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
     tran, wave, stop = circuit.tran, scene.network.waveform, t_stop
     if stop is None:
-        if tran is None and (t_eval is None or not t_eval.size):
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+        endless = "no t_stop: the deck has no .tran line and none was given; give t_stop in s"
+        refuse(tran is None and (t_eval is None or not t_eval.size), endless)
         stop = float(t_eval[-1]) if tran is None else t_start + tran.stop  # type: ignore[index]
     require(math.isfinite(stop) and stop > t_start, "t_stop", f"{stop:g} s", f"more than {t_start:g} s")
     if t_eval is not None:
@@ -254,9 +254,7 @@ def _output_times(problem: Problem, jumps: str) -> FloatArray:
     if at.size:
         nearest = at[np.searchsorted(0.5 * (at[1:] + at[:-1]), grid)]
         grid = grid[np.abs(grid - nearest) > 1e-9 * step]
-    t = np.sort(np.concatenate([grid, at, at]))
-    t.flags.writeable = False
-    return t
+    return read_only(np.sort(np.concatenate([grid, at, at])))
 
 
 PERIODS_PER_WINDOW, BREAKPOINTS_PER_WINDOW = 4096.0, 2000.0
@@ -278,16 +276,14 @@ class Tables:
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
         span, wave = problem.t_stop - problem.t_start, problem.network.waveform
         # A function is sampled at the output step.
-        longest = 4096.0 * problem.step if problem.scene.is_sampled else math.inf
+        longest = 4096.0 * problem.step if wave.is_sampled else math.inf
         longest = min(longest, PERIODS_PER_WINDOW * wave.shortest_time())
         rate = max(wave.breakpoint_rate() / BREAKPOINTS_PER_WINDOW, 1.0 / longest)
         count = max(1, int(np.ceil(span * rate)))
         # Limits (s) of the windows: short ones bound memory and the phases' round-off.
         self.edges = [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
-        # An iteration skips windows that end by this time (s), except the last window.
-        self.done = -np.inf
-        # Largest interpolation error (V) of a table that a finer table would not reduce.
-        self.rough = 0.0
+        self.done = -np.inf  # An iteration skips windows that end by this time (s), except the last window
+        self.rough = 0.0  # Largest interpolation error (V) of a table that a finer table would not reduce
         # First output time (s) at which a user's function differs from its table, the difference (V), and its number.
         self.unseen: tuple[float, float, int] | None = None
         # Time (s) at which a source stops being finite, once the iteration has reached it.
@@ -296,8 +292,8 @@ class Tables:
         # rises out of next to nothing would be followed there beyond its own digits.
         peaks = [wave.kept.get("peak", (None, 0.0))[1] for wave in problem.network.waveforms]
         self.scales = [peak if np.isfinite(peak) else 0.0 for peak in peaks]
-        few = problem.network.waveform if len(self.edges) <= 1 + KEPT_WINDOWS else None
-        self.keeper: Remembering | None = Remembering() if problem.scene.is_sampled else few
+        few = wave if len(self.edges) <= 1 + KEPT_WINDOWS else None
+        self.keeper: Remembering | None = Remembering() if wave.is_sampled else few
 
     def __iter__(self) -> Iterator[list[SourceTable]]:
         for w0, w1 in itertools.pairwise(self.edges):
@@ -324,14 +320,6 @@ class Tables:
                 self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
             tables.append(table)
         return tables
-
-    def peak(self) -> float:
-        """Largest source voltage (V) of the run; of users' functions also between the samples that a scene knows."""
-        problem = self.problem
-        if not problem.scene.is_sampled:
-            return problem.scene.u_peak or problem.network.waveform.peak(problem.t_start, problem.t_stop)
-        met = (table.scale for tables in self for table in tables[: problem.network.n_voltage])
-        return max(met, default=0.0) or problem.scene.u_peak
 
 
 def shortest_event(problem: Problem) -> float:

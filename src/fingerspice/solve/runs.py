@@ -132,8 +132,7 @@ class Integration(ABC):
         self.s_before = problem.initial.s_before.copy()
         self.n_slow = self.y.size - self.n - n_s
         self.width = self.y.size + (n_s if problem.charge else 0)
-        # The last attempted steps, see `last_tried`.
-        self.tried = np.zeros((TRIED, 4))
+        self.tried = np.zeros((TRIED, 4))  # The last attempted steps, see `last_tried`
 
     @property
     @abstractmethod
@@ -236,11 +235,9 @@ def nodes_apart(one: Record, other: Record) -> float:
 
 def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
     """The failure of a run. At a fold, the gap with the smallest area relative to its area at 0 V is named."""
-    status, cause, names = run.status, run.status.cause, _measured(problem)
+    status, cause, names = run.status, run.status.cause, _concerned(problem, run.status, run.t_failed)
     element, u_gap, area, margin = ", ".join(names), None, None, None
-    if status is Status.SOURCE_NOT_FINITE and run.t_failed is not None:
-        element = ", ".join(_not_finite_at(problem, run.t_failed))
-    elif status is Status.SOURCE_UNSEEN and run.unseen is not None:
+    if status is Status.SOURCE_UNSEEN and run.unseen is not None:
         _, off, place = run.unseen
         element, device = ", ".join(_written(problem, place)), problem.network.sources[place].device
         cause += f" (by {off:.3g} {'A' if device == 'I' else 'V'})"
@@ -267,13 +264,15 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
 
 def no_period(problem: Problem, status: Status, t: float | None = None, cause: str = "") -> SolveError:
     """The end of a search for the periodic state, which found none."""
-    names = _measured(problem) if status is not Status.SOURCE_NOT_FINITE or t is None else _not_finite_at(problem, t)
     cause = cause or f"no periodic state was reached: {status.cause}"
-    return SolveError(Failure(status, cause, status.action, t, ", ".join(names)))
+    return SolveError(Failure(status, cause, status.action, t, ", ".join(_concerned(problem, status, t))))
 
 
-def _measured(problem: Problem) -> list[str]:
-    """Names of the elements for whose voltages an error is stated."""
+def _concerned(problem: Problem, status: Status, t: float | None) -> list[str]:
+    """Names of the elements whose voltages have a stated error, or of the sources that are not finite at time t, s."""
+    if status is Status.SOURCE_NOT_FINITE and t is not None:
+        broken = [i for i, wave in enumerate(problem.network.waveforms) if not np.isfinite(wave.value(t))]
+        return [name for i in broken for name in _written(problem, i)]
     return [problem.network.cells[i].element.name for i in problem.scene.measured]
 
 
@@ -281,9 +280,3 @@ def _written(problem: Problem, place: int) -> list[str]:
     """Names of the deck's sources that are combined in source number `place` of the network."""
     stack = problem.network.stack
     return [problem.network.sources[place].name] if stack is None else [e.name for e, _ in stack.sources]
-
-
-def _not_finite_at(problem: Problem, t: float) -> list[str]:
-    """Names of the sources without a finite value at time t, s."""
-    broken = [i for i, wave in enumerate(problem.network.waveforms) if not np.isfinite(wave.value(t))]
-    return [name for i in broken for name in _written(problem, i)]

@@ -46,11 +46,6 @@ class Scene(Remembering):
     skin: tuple[float, float] | None = None
 
     @cached_property
-    def is_sampled(self) -> bool:
-        """Whether some source is a user's function, which has to be sampled, not a waveform with a formula."""
-        return any(w.is_sampled for w in self.network.waveforms)
-
-    @cached_property
     def coupled(self) -> bool:
         """Whether some area follows its gap's voltage."""
         return any(area is None for area in self.fixed)

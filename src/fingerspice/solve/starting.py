@@ -35,7 +35,7 @@ from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.scenes import Scene
-from fingerspice.waveforms.waveform import DC, require
+from fingerspice.waveforms.waveform import DC
 
 
 def model_of(scene: Scene) -> Model:
@@ -97,7 +97,6 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
                 f"is another circuit's; allowed: one of this circuit, {', '.join(names)} and {scene.charge_law}"
             )
         return start.state
-    require(start in ("deck", "uncharged", "dc"), "start", repr(start), "'deck', 'uncharged', 'dc' or a Solution")
     asked = start == "deck"
 
     def make() -> State:
@@ -155,12 +154,11 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
     else:
         raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
     if stack is not None:
-        found = list(zip(network.cells, u.tolist(), strict=True))
-        of = {e.name: [v for cell, v in found if cell.element is e] for e in stack.layers}
+        of: dict[str, list[float]] = {}
         for layer, count in zip(stack.layers, stack.cells, strict=True):
-            if count == 1:
-                # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
-                of[layer.name] = [sum(of[layer.name])]
+            each = [v for cell, v in zip(network.cells, u.tolist(), strict=True) if cell.element is layer]
+            # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
+            of[layer.name] = each if count > 1 else [sum(each)]
         u = np.array([of[cell.element.name].pop(0) for cell in scene.network.cells])
     for place in np.flatnonzero(held & (net.slow < 0)) if net.mobile else ():
         # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.

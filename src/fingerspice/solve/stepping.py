@@ -18,35 +18,30 @@ from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
-from fingerspice.results.steps import Recorded, Recorder
+from fingerspice.results.steps import Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
 from fingerspice.waveforms.sampling import same_time
 
-# Runs of fewer periods are integrated throughout, because nothing would be saved.
-FEWEST_PERIODS = 6.0
+FEWEST_PERIODS = 6.0  # Runs of fewer periods are integrated throughout, because nothing would be saved
 # Number of the source's periods after which a run's error is first compared with its peaks, where ten times as many
-# are left.
+# are left: the tolerance was chosen before the peaks were known, and a run where it proves too large ends there.
 TRIAL_PERIODS = 2.0
-# Remaining change allowed over all later periods, as a fraction of the error allowed in a step.
-_SHARE = 1.0 / 3.0
+_SHARE = 1.0 / 3.0  # Remaining change allowed over all later periods, as a fraction of the error allowed in a step
 # Ratio of stated to estimated error: the largest error of a step may lie beside the points at which it is estimated,
 # and contributions of opposite sign may cancel at these points.
 SAFETY = 2.5
 # Error allowed in a step, relative to the error asked for: a relative error of the voltage counts twice in the force,
 # and the errors of the steps add up.
 LOCAL_SHARE = 0.15
-# Smallest error of a step above round-off, relative to the voltage scale.
-FINEST = 4e-15
+FINEST = 4e-15  # Smallest error of a step above round-off, relative to the voltage scale
 # Error allowed in a step, relative to the one before, once the voltages have settled and a period is to be repeated so
 # often that the errors of its charge add up.
 FINER = 0.01
 # Longest step, relative to the source's shortest time scale: the collocation nodes must not alias the source.
 LONGEST_STEP = 0.6
-# Parts of a run under a chirp, in each of which the longest step is that of the highest frequency there.
-PARTS = 8
-# Most steps of a period that is kept for repetition: 1 MB.
-KEPT_STEPS = 2000
+PARTS = 8  # Parts of a run under a chirp, in each of which the longest step is that of the highest frequency there
+KEPT_STEPS = 2000  # Most steps of a period that is kept for repetition: 1 MB
 
 
 class OutOfRangeError(Exception):
@@ -62,11 +57,9 @@ class Stepping(Integration):
     area_error: float  # Relative error of the areas' polynomials
     capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
     charge_safety = 1.0  # Stated error of the charge over the estimate
+    rates: FloatArray  # Decay rates of the modes, among them those at 0 V, 1/s
+    looks = loop.no_looks()  # Those of a run that `look` does not prepare
     fresh: list[Any] | None = None  # What an integration that begins `again` sets its arrays to
-    # The stated error is compared with this after a few periods, where `try_out` was called. The tolerance was chosen
-    # before the peaks of the gaps were known; if it proves too large, the run ends there and not at its end before it
-    # is repeated.
-    asked = math.inf
 
     def __init__(self, problem: Problem, tol: float, shown: int, width: int) -> None:
         self.controls = np.zeros(1, readout.CONTROL)
@@ -89,18 +82,23 @@ class Stepping(Integration):
         self.recorder = Recorder(shown)
         self.keep(0)
 
-    def look_for_period(self, rates: FloatArray, scale: FloatArray, repeat: bool) -> None:
-        """Prepare the looks of the run, none unless it is to `repeat` a period; `rates` (1/s) are those at 0 V."""
-        problem, values = self.problem, np.zeros(loop.N_VALUES)
-        start, live = max(problem.t_start, problem.network.waveform.settled), [x for x in rates.flat if x > 0.0]
+    def look(self, asked: float, repeat: bool) -> None:
+        """Look for the periodic state, if the run is to `repeat` a period; judge its error early, against `asked`."""
+        problem, values, self.asked = self.problem, np.zeros(loop.N_VALUES), asked
+        start, live = max(problem.t_start, problem.network.waveform.settled), [x for x in self.rates.flat if x > 0.0]
         values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, self.period
         values[loop.ALLOWED], values[loop.HAS_CHARGE] = _SHARE * self.pace.tol, problem.charge
         values[loop.LOOKED] = -1.0
         # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
         values[loop.RATE] = loop.RATE_SHARE * min(live, default=math.inf)
         values[loop.DISTANCE] = values[loop.REMAINING] = values[loop.TRIAL] = math.inf
-        self.periods = (problem.t_stop - start) / self.period * (1.0 + 1e-12)
-        values[loop.NEXT] = start if repeat and self.periods >= FEWEST_PERIODS else math.inf
+        periods = (problem.t_stop - start) / self.period * (1.0 + 1e-12)
+        values[loop.NEXT] = start if repeat and periods >= FEWEST_PERIODS else math.inf
+        if asked < math.inf and periods >= 1.0 + 10.0 * TRIAL_PERIODS:
+            values[loop.TRIAL] = start + TRIAL_PERIODS * self.period
+            values[loop.ACCEPTABLE] = asked / SAFETY
+        scale = np.ones(self.n + self.n_slow)
+        scale[self.n :] = self.largest
         self.looks = Looks(values, np.zeros(scale.size), scale)
 
     def again(self, initial: State, tol: float) -> None:
@@ -120,13 +118,6 @@ class Stepping(Integration):
     @property
     def t(self) -> float:
         return float(self.control["t"])
-
-    def try_out(self, asked: float) -> None:
-        """Compare the stated error with `asked` after a few periods, if many are left."""
-        self.asked, values = asked, self.looks.values
-        if self.periods >= 1.0 + 10.0 * TRIAL_PERIODS:
-            values[loop.TRIAL] = values[loop.START] + TRIAL_PERIODS * self.period
-            values[loop.ACCEPTABLE] = asked / SAFETY
 
     @abstractmethod
     def circuit(self, sources: Sources) -> Circuit:
@@ -169,8 +160,11 @@ class Stepping(Integration):
         return found
 
     def stated(self, run: Run) -> None:
-        """Write the stated errors and the margin into a run."""
-        peaks = self.stated_peaks()
+        """Write the recorded steps, the stated errors and the margin into a run."""
+        self.recorder.drain(self.counters)
+        peaks, shown = self.stated_peaks(), self.problem.scene.shown
+        run.continuous = self.recorder.finish(self.problem.first, partial(Record, shown.network, shown.net))
+        run.stats["repeated"] = self.repeated
         run.gaps, run.margin = np.array([peaks[i] for i in self.gaps]).reshape(-1, 4), self.margin
         run.node_error = peaks[-1][readout.ERROR_U]
         if not self.pace.charge:
@@ -263,9 +257,3 @@ class Stepping(Integration):
             if peak[readout.PEAK_U] > 0.0:
                 peak[readout.ERROR_F] += off * 2.0 * peak[readout.PEAK_F] / peak[readout.PEAK_U]
         self.repeated += periods
-
-    def recorded(self) -> Recorded | None:
-        """The recorded steps of the run so far."""
-        self.recorder.drain(self.counters)
-        shown = self.problem.scene.shown
-        return self.recorder.finish(self.problem.first, partial(Record, shown.network, shown.net))
