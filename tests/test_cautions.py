@@ -235,8 +235,6 @@ def said_by(make: Callable[[], object]) -> list[str]:
     return [str(w.message) for w in caught]
 
 
-# What is said
-
 #: Name, a change of the deck, its path and value if it is one in Python, what the warning says, and what was meant.
 SLIPS = listed("slips")
 
@@ -316,9 +314,6 @@ def test_a_load_that_leaves_no_contact_is_refused_with_the_likely_slip() -> None
             make()
 
 
-# Results
-
-
 def test_results_out_of_this_world_are_warned_about() -> None:
     with pytest.warns(fs.FingerspiceWarning):
         circuit = table1(gap={"alpha": "54.4meg"}, tran="50u 10m uic")
@@ -355,9 +350,6 @@ def test_a_batch_of_gaps_in_the_wrong_unit_is_warned_about_once() -> None:
 def test_an_area_given_in_mm2_in_python_is_warned_about() -> None:
     said = said_by(lambda: fs.simulate(table1(tran="50u 10m uic"), area=35.0))
     assert "the contact area reaches 35 m^2, over 0.001 m^2 (10 cm^2, more than a finger has)" in " ".join(said)
-
-
-# What is not said
 
 
 def test_shipped_decks_are_usual() -> None:

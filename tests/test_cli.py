@@ -131,9 +131,6 @@ def test_a_solve_that_fails_keeps_what_it_has_and_says_when_and_how_close(comman
     assert "last steps tried:" in plain
 
 
-# Warnings and notes
-
-
 @pytest.mark.parametrize("name", ["run", "compare"])
 def test_a_skin_at_another_frequency_or_too_much_voltage_is_warned_about_once(command: Command, name: str) -> None:
     result = command(name, "pad.cir", "--no-plot", "--set", "Xskin.f=200")
@@ -167,9 +164,6 @@ def test_values_on_the_command_line_have_the_traps_of_the_deck(command: Command)
     assert first.startswith("fingerspice: warning: --area 35 is in m^2, 3.5e+07 mm^2")
     assert rest[-1].startswith("fingerspice: warning: the contact area reaches 35 m^2, over 0.001 m^2 (10 cm^2,")
     assert not command(*words, "--area", "35u").lines
-
-
-# ac, compare, export, figures
 
 
 def test_ac_sweeps_the_decks_line_or_the_one_given(command: Command) -> None:
