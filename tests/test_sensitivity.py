@@ -241,6 +241,9 @@ def test_a_parameter_near_whose_value_there_is_no_period_is_refused_in_a_periodi
         _ = fs.steady_state(circuit, sensitivities=("Vdrive.carrier",)).sensitivities
     with pytest.raises(InputError, match=r"Vdrive\.modulation, near whose value the source has no such period"):
         fs.simulate(circuit, t_stop=0.02, start="periodic", sensitivities=("Xgap.d", "Vdrive.modulation"))
+    # When it is asked for, not when the run of a period is looked at.
+    with pytest.raises(InputError, match="nearest: 'Xgap.d'"):
+        fs.steady_state(circuit, sensitivities=("Xgap.dd",))
 
 
 def test_a_frozen_area_has_them(table_1: fs.Circuit) -> None:

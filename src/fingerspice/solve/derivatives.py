@@ -119,6 +119,8 @@ def check_request(problem: Problem, paths: Sequence[str], method: str) -> str:
         (f"the method is {method!r}", method not in ("auto", "exponential")),
     ):
         refuse(refused, f"sensitivities are asked for, and {what}; allowed: {allowed}")
+    for path in paths:
+        _Parameter(problem, path)
     # A recording, or a PWL with many points, is otherwise followed point by point, to no error as small as needed here.
     return method if driving(problem)[1] is None else "exponential"
 
