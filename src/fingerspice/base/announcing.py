@@ -28,7 +28,8 @@ _NOT_KEPT = f"at every run: {_NO_FOLDER}; set NUMBA_CACHE_DIR to one that can"
 class Bar:
     """A progress bar on stderr, removed when stopped; none where stderr is no terminal.
 
-    There is one at a time. An endless one, which shows the time taken, stands for any other until that is shown next.
+    There is one bar at a time: an endless one, for an unknown amount of work, shows the time taken. It takes the place
+    of any other, which comes back when it is shown next.
     """
 
     _standing: ClassVar[Bar | None] = None
@@ -69,7 +70,8 @@ def paced(what: str, first: float = 0.0) -> Iterator[Callable[..., None]]:
     """A bar for work of which a share is done at first, shown after one second; gives what sets the share of now."""
     bar, begun = Bar(what), time.perf_counter()
 
-    def show(done: float, pace: Callable[[float], str] = lambda _: "") -> None:  # `pace` words the pace by seconds.
+    # `pace` gives the words for the pace from the seconds taken.
+    def show(done: float, pace: Callable[[float], str] = lambda _: "") -> None:
         took = time.perf_counter() - begun
         if took > 1.0 and done > first and sys.stderr.isatty():
             minutes, seconds = divmod(int((1.0 - done) * took / (done - first)), 60)

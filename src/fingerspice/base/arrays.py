@@ -47,7 +47,8 @@ def read_only(x: Array) -> Array:
 def real_numbers(what: str, given: object, allowed: str) -> FloatArray:
     """Numbers that a user gives as doubles, of any shape; they may be the given array itself.
 
-    Complex or masked ones, booleans, other objects and uneven rows are refused: `what` they are, and what is `allowed`.
+    Refused are complex and masked ones, and what is no number (texts, booleans, dates, other objects, rows of unequal
+    length); for the message, `what` names the numbers and `allowed` says what they may be.
     """
     kind = f", a {type(given).__name__}"
     with suppress(TypeError, ValueError, RuntimeError):  # NumPy makes no array of tensors with gradients or on a card.
@@ -140,6 +141,7 @@ def keep_freed_memory() -> None:
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if "MALLOC_TRIM_THRESHOLD_" in os.environ else None
     if mallopt is not None:
-        # As in malloc.h: M_TRIM_THRESHOLD, most that is free on top of the heap; M_MMAP_THRESHOLD, its largest block.
+        # As in malloc.h: M_TRIM_THRESHOLD, what may be free at the top of the heap, and M_MMAP_THRESHOLD, the size
+        # below which blocks come from the heap.
         for parameter in (-1, -3):
             mallopt(parameter, 128 << 20)

@@ -1,10 +1,14 @@
-"""Errors of wrong input, with their place in a netlist, and warnings; that of a solve is in `results.outcome`."""
+"""Errors of wrong input, with their place in a netlist, and warnings.
+
+The other error that users meet, of a solve that did not reach its end, is `fingerspice.results.outcome.SolveError`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-LONGEST_MESSAGE = 1000  #: Characters of a message; the middle of a longer one, a text of the user, is left out.
+#: Characters of a message; the middle of a longer one, which contains a long text of the user, is left out.
+LONGEST_MESSAGE = 1000
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,8 @@ class InputError(FingerspiceError, ValueError):
 
 def printable(text: str, longest: int = LONGEST_MESSAGE) -> str:
     """One line that is safe to show: control characters are escaped, and the middle of a long text is left out."""
-    text = _shortened(text, longest)  # Before escaping, to leave it little, and after it, since it lengthens the text.
+    # Shortened before escaping, which then has little to do, and after it, since it lengthens the text.
+    text = _shortened(text, longest)
     if text.isprintable():
         return text
     return _shortened("".join(c if c.isprintable() else repr(c)[1:-1] for c in text), longest)

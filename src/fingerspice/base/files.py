@@ -21,7 +21,8 @@ _PIECE = 64 * 2**20
 def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
     """Call `write` with a temporary path in the same folder, then rename that file to `path`.
 
-    The file that a link names is replaced, and a device written directly. Full disks and closed folders are refused.
+    Where `path` is a link the file that it names is replaced; a device is written directly. Refused are folders that
+    cannot be written and full disks.
     """
     target = Path(os.path.realpath(path))
     temporary = target.parent / f"{UNFINISHED}{os.urandom(6).hex()}"
@@ -30,7 +31,8 @@ def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
         if path.exists() and not path.is_file():
             write(path)
             return path
-        _UNFINISHED.add(temporary)  # Before it exists: `discard_unfinished` finds it whenever a signal comes.
+        # Entered before the file exists, so that `discard_unfinished` finds it whenever a signal comes.
+        _UNFINISHED.add(temporary)
         hint = "; allowed: a folder that can be written"
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch(exist_ok=False)
@@ -114,7 +116,8 @@ def mend_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # It gets the lowest free number, this one; else the next file would.
+            # Opens the lowest free number, which is this one; else the first file opened would become this stream.
+            os.open(os.devnull, os.O_RDWR)
     for number, name in ((1, "stdout"), (2, "stderr")):
         raw, encoding = _Raw(number, "w", closefd=False), getattr(getattr(sys, name), "encoding", None) or "utf-8"
         buffer, lines = io.BufferedWriter(raw), raw.isatty() or number == 2

@@ -59,7 +59,10 @@ def parse_number(text: str) -> float:
 
 
 def suspicious_mega(text: str) -> str:
-    """A number with a capital M, milli in SPICE, as it was meant: ``0.2meg`` of ``0.2MOhm``; else an empty text."""
+    """What was probably meant by a number with a capital M, SPICE's milli that people read as mega.
+
+    ``0.2MOhm`` gives ``0.2meg``; any other number, as ``1MEG``, gives an empty text.
+    """
     match = _MEGA.fullmatch(text)
     return f"{text[: match.start(1)]}meg" if match is not None and match[1][0] == "M" else ""
 
@@ -74,7 +77,8 @@ def format_si(value: float, unit: str, digits: int = 4) -> str:
     """A value in engineering notation, without trailing zeros: ``format_si(3.5e-6, "m")`` gives ``3.5 um``."""
     if not math.isfinite(value) or value == 0.0:
         return f"{value + 0.0:g} {unit}".rstrip()
-    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")  # 999.96 to four digits is 1 k.
+    # Rounded first, as 999.96 to four digits is 1 k and not 1000.
+    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
     power = 3 * (int(exponent) // 3)
     if power not in _PREFIXES:
         return f"{value:.{digits}g} {unit}".rstrip()
@@ -111,6 +115,7 @@ def _power_of_ten(letters: str, text: str, as_written: str) -> int:
 
 
 def _why_not_a_number(text: str) -> str:
+    """Why a text is not a number, with what to write where that can be guessed."""
     match = _LETTER_AS_POINT.fullmatch(text)
     if match is not None:
         whole, letters, fraction = match.groups()

@@ -162,7 +162,13 @@ class Circuit(Remembering, Shown):
         return circuit_page(self)
 
     def __getitem__(self, name: str) -> Element:
-        """The element of that name, in upper or lower case; where there is none, the error gives the nearest name."""
+        """The element of that name, in upper or lower case.
+
+        Raises
+        ------
+        InputError
+            If there is none; the message gives the nearest name.
+        """
         found = next((e for e in self.elements if e.name.lower() == name.lower()), None)
         if found is None:
             raise InputError(_unknown("element", name, [e.name for e in self.elements]))
@@ -178,7 +184,7 @@ class Circuit(Remembering, Shown):
         return MappingProxyType({f"{e.name}.{name}": p for e in self.elements for name, p in e.parameters.items()})
 
     def draw(self, path: str | Path | None = None) -> Any:
-        """Draw the schematic as a matplotlib figure: a notebook shows it as SVG, ``draw().show()`` opens a window.
+        """Draw the schematic: a notebook shows it as SVG, and from a script ``draw().show()`` opens a window.
 
         Layers stand as a resistor beside a capacitor, or as a capacitor alone where they do not leak; nodes are rows,
         and the lowest one is ground.
@@ -187,6 +193,11 @@ class Circuit(Remembering, Shown):
         ----------
         path : str or Path, optional
             File to write, whose end says its kind: ``.svg`` or ``.png``.
+
+        Returns
+        -------
+        Schematic
+            A matplotlib figure.
 
         Raises
         ------
@@ -198,7 +209,13 @@ class Circuit(Remembering, Shown):
         return draw_circuit(self, path)
 
     def explore(self) -> Any:
-        """Show the circuit on a local page, in a notebook below the cell; gives the running page (docs/explore.md)."""
+        """Show the circuit on a local page, in a notebook below the cell (docs/explore.md).
+
+        Returns
+        -------
+        Explorer
+            The running page.
+        """
         from fingerspice.explorer.server import explore
 
         return explore(self)
@@ -268,6 +285,7 @@ class Circuit(Remembering, Shown):
         return changed
 
     def _unknown_path(self, path: str) -> str:
+        """The message about a path that `replace` does not know."""
         name = path.rpartition(".")[0] or path
         inside = [e.name for e in self.elements if e.name.lower().startswith(f"{name.lower()}.")]
         if not inside:

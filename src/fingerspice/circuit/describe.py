@@ -1,6 +1,7 @@
 """A circuit in words and its digests, checks of a call's arguments, and warnings before a run.
 
-What is said about a skin's data, outside their band or at one frequency, rests on the source's spectrum.
+What is said about a skin's data rests on the source's spectrum: its energy outside their band, and the error of data
+held at one frequency.
 """
 
 from __future__ import annotations
@@ -33,7 +34,10 @@ from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, requ
 
 
 def remembering(circuit: Circuit, name: str, values: Mapping[str, Any]) -> Circuit:
-    """The circuit, which remembers that the set of that name, and no earlier one, gave these values, by path."""
+    """The circuit, which remembers that the set of that name gave these values, by path.
+
+    An earlier set no longer answers for the values that this one replaces.
+    """
     given = {path.lower() for path in values}
     sets = {one: {p: v for p, v in old.items() if p.lower() not in given} for one, old in circuit.sets.items()}
     own = {**sets.pop(name, {}), **values}
@@ -100,7 +104,10 @@ def _own_text(source: Element) -> str:
 
 
 def drive_text(circuit: Circuit) -> str:
-    """Every source that is not 0 with its waveform, but for those in `changes_text`: ``V1: Sine(200 V, 100 Hz)``."""
+    """Every source that is not 0 with its waveform: ``Vdrive: Sine(200 V, 100 Hz)``.
+
+    Sources that were replaced are left out, since `changes_text` lists them.
+    """
     kept = {path.lower() for values, _ in in_force(circuit).values() for path in values}
     replaced = {path.lower() for path in circuit.overrides} - kept
     on = (e for e in driving(circuit) if e.waveform not in (None, OFF) and e.name.lower() not in replaced)
@@ -108,7 +115,10 @@ def drive_text(circuit: Circuit) -> str:
 
 
 def changes_text(circuit: Circuit) -> str:
-    """Changes since the deck was read, as ``Xgap.d = 5 um``, or by a set whose values still hold: ``set moist``."""
+    """Changes made after the deck was read, with the present values: ``Xgap.d = 5 um``; empty without changes.
+
+    Values that a set of parameters gave, and that still hold, are named by the set: ``set moist``.
+    """
     sets = {name: kept for name, (kept, _) in in_force(circuit).items() if kept}
     now = {e.name.lower(): f"{e.name} = {_own_text(e)}" for e in circuit.elements if e.waveform is not None}
     now |= {path.lower(): f"{path} = {shown(p.value, p.unit)}" for path, p in circuit.parameters.items()}
@@ -164,7 +174,8 @@ def _joined(said: list[str]) -> str:
     return ", ".join([*said[:_MOST], *([f"and {len(said) - _MOST} more"] if len(said) > _MOST else [])])
 
 
-Source = Waveform | float | Callable[[float], float]  #: A waveform, a constant (V or A), or a function of time (s).
+#: A waveform, a constant (V, or A of a current source), or a function of time (s).
+Source = Waveform | float | Callable[[float], float]
 Sources = Mapping[str, Source] | Source
 Parameters = Mapping[str, float]
 
@@ -172,7 +183,8 @@ Parameters = Mapping[str, float]
 def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Parameters | None = None) -> Circuit:
     """The circuit with the sources and parameters given in a call, with warnings about sources that stay on.
 
-    Of one source the waveform, constant or function alone is enough; `parameters` is as in `Circuit.replace`.
+    For a circuit with one source, its waveform, constant or function alone is enough; `parameters` is as in
+    `Circuit.replace`.
     """
     require_circuit(circuit)
     if parameters:
@@ -218,17 +230,22 @@ def area_given(area: Any) -> str | float:
     return number
 
 
-# Largest relative difference of equal frequencies, smallest told one of a mean force, words of warnings about a SKIN.
+# Largest relative difference of frequencies that are the same, and smallest one of the mean force that is given as a
+# number; and the words by which a warning about a SKIN begins.
 _SAME, _LITTLE, _TAKES = 1e-9, 0.005, "takes its data at f ="
-# Fewest points of a PWL that is meant as a recording, and smallest fraction of a run that one fills without a warning.
+# Smallest number of points that make a PWL a recording, which is meant to be run to its end and not to be a step in a
+# longer run; and the smallest fraction of a run that a recording fills without a warning.
 _RECORDED, _FILLED = 100, 0.01
-# Times (s) from `_CLOCK` (in 1973) on are a clock's; those `_OTHER_UNIT` times a run's end or more in another unit.
+# Times (s) from `_CLOCK` on are those of a clock (this is a day in 1973, counted from 1970); times beyond the end of a
+# run by a factor of `_OTHER_UNIT` or more are probably in another unit.
 _CLOCK, _OTHER_UNIT = 1e8, 20.0
-_MOST_SAMPLES, _PERIODS = 2**17, 16  # Most samples of a spectrum; periods over which data at one frequency are judged.
+# Largest number of samples of a spectrum; and of periods over which a skin's data at one frequency are judged.
+_MOST_SAMPLES, _PERIODS = 2**17, 16
 # Number of pieces that represent a long run of a source without period; frequencies of gains, Hz; and Hann's windows.
 _PIECES, _GRID = 4, np.geomspace(*SKIN_BAND, 49)
 _window = lru_cache(maxsize=8)(np.hanning)
-# Least length (s) of a recording's pieces, two periods of the lowest data; fewer samples are taken as straight lines.
+# Least length (s) of a piece of a recording, two periods of the lowest frequency of the skin's data; and the number of
+# samples up to which straight lines between them are looked at instead.
 _LEAST, _FEW = 2.0 / SKIN_BAND[0], 4096
 NOTABLE = 0.01  # A source is in a band if no more than this fraction of its energy is outside.
 # The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
@@ -257,6 +274,7 @@ def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) 
     """
     for name, wave in ((e.name, e.waveform) for e in driving(circuit) if e.waveform is not None):
         (first, last), recording = wave.course, as_samples(wave)
+        # Of a recording or table; 0 of other waveforms.
         table = len(wave.times) if isinstance(wave, PWL) and wave.repeat is None else 0
         count = table if recording is None else recording.count
         if (count > 1 and last < start == 0.0) or stop <= first < math.inf:
@@ -322,7 +340,8 @@ def scenes_warnings(
 def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
     skins = circuit.by_device("SKIN")
     waves = network_of(circuit).waveforms if skins else ()
-    for skin in skins if len(waves) == 1 else ():  # Of several sources only the user knows which frequency to take.
+    # With several sources only the user can know at which frequency the skin data should be taken.
+    for skin in skins if len(waves) == 1 else ():
         (wave,), fundamental, known = waves, waves[0].fundamental, 0.0 < stop < math.inf
         f = skin.values["f"]
         taken = f"{skin.name} {_TAKES} {f:g} Hz"
@@ -415,7 +434,10 @@ def energy_outside(waveform: Waveform, t_stop: float, band: tuple[float, float] 
 
 
 def is_near(waveform: Waveform, t_stop: float, frequency: float) -> bool:
-    """Whether 99 % of a source's energy is within 5 % of a frequency (Hz), where the skin's data change by 3 %."""
+    """Whether 99 % of a source's energy is within 5 % of a frequency (Hz), as of a carrier with a slow envelope.
+
+    In that band the skin's data change by 3 %.
+    """
     if (found := _recorded(waveform, t_stop)) is not None:
         # A coarse look at a recording suffices if it finds a fifth of the energy more than half an octave away.
         (f, energy), blurred = found, 2.0 * found[0][1]
@@ -447,7 +469,8 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
         return None
 
     def at_lines() -> list[list[FloatArray]]:
-        place = np.log(np.maximum(f, SKIN_BAND[0]))  # In log f; beyond the ends of the grid they are those of the ends.
+        # The gains are interpolated in log f; beyond the ends of the grid they are those of the ends.
+        place = np.log(np.maximum(f, SKIN_BAND[0]))
         return [[np.interp(place, np.log(_GRID), row) for row in square] for square in squares]
 
     gains = shared(circuit, ("gains at", f.size, f[-1]), at_lines)
@@ -479,7 +502,8 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     dispersive, frozen = build_stack(circuit), build_stack(circuit, skin_at=frequency)
     span = min(t_stop, _PERIODS / frequency)
     u = _samples(dispersive.waveform, 0.0, span, _enough(span, 200.0 * frequency))
-    lines = np.fft.rfft(u, 2 * u.size)  # Padded with zeros to twice its length, as the transform is cyclic.
+    # The run is padded with zeros to twice its length, because the discrete transform is cyclic.
+    lines = np.fft.rfft(u, 2 * u.size)
     f = np.arange(1, lines.size) / (2.0 * span)
     gains = [layer_gains(stack.admittance(f, np.array([area])))[:, stack.gap_layer] for stack in (dispersive, frozen)]
     responses = (np.append(0.0, gain * lines[1:]) for gain in (gains[0], gains[1] - gains[0]))

@@ -2,7 +2,8 @@
 
 A parameter has its unit, its default, and its legal and usual range; a value outside the usual one is warned about. The
 reader, runs, phasors and the export use the entry alone. For ngspice a layer also needs a subcircuit of the same name,
-nodes, parameters and defaults in both libraries in `circuits`, as `tests/test_devices.py` checks.
+nodes, parameters and defaults in `fingerspice.lib` and `fingerspice_mobile.lib`; `tests/test_devices.py` compares the
+entry with the subcircuits.
 """
 
 from __future__ import annotations
@@ -80,7 +81,8 @@ class ParameterSpec:
     first: bool = False  # Whether the explorer's page shows it at once: the paper varies it, or Table 1 gives it
     may_be_zero: bool = False
     may_be_infinite: bool = False
-    least: float = 1e-30  # Range of other numbers: of any device, and no product or quotient overflows
+    # Range of all other numbers: wide enough for any device, and so narrow that products and quotients do not overflow
+    least: float = 1e-30
     most: float = 1e30
     slider: float | None = None  # Upper end of the slider of a value that is 0 in the deck
 
@@ -163,6 +165,7 @@ _CELLS: Mapping[str, Cells] = {
 
 
 def _device(name: str, parameters: Iterable[dict[str, Any]] = (), **given: Any) -> DeviceSpec:
+    """A device from its entry in the file."""
     specs = tuple(ParameterSpec(**{**one, "usual": _USUAL[one["usual"]]}) for one in parameters)
     words: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in given.items()}
     return DeviceSpec(name, parameters=specs, cells=_CELLS.get(name), **words)

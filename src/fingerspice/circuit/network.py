@@ -48,7 +48,10 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Network(Remembering):
-    """A connected network: n live states, one for each capacitor of the tree; n_s sources, voltages first. In SI."""
+    """A connected network of capacitors, resistors, sources and layers. SI throughout.
+
+    n live states, one for each capacitor of the tree; n_s sources, voltage sources first.
+    """
 
     sources: tuple[Element, ...]
     n_voltage: int  # Number of voltage sources among them
@@ -58,18 +61,26 @@ class Network(Remembering):
     areas: tuple[Area, ...]
     contacts: tuple[Contact | None, ...]  # Contact of each area; None for an area without GAP
     gaps: tuple[int | None, ...]  # Index of the cell of each area's GAP
-    p: FloatArray  # (n_cell, n), and q (n_cell, n_s): u = p x + q s
+    # p (n_cell, n), q (n_cell, n_s): u = p x + q s
+    p: FloatArray
     q: FloatArray
-    k: FloatArray  # (n, n), and b (n, n_s): Currents of resistors and current sources into live capacitors' cuts, S
+    # k (n, n), b (n, n_s): Currents of resistors and current sources into the cuts of the live capacitors, S
+    k: FloatArray
     b: FloatArray
     through: FloatArray  # (n_s, n_cell)
-    delivered: FloatArray  # (n_s, n + n_s): A V delivers from p, an I from n: through @ i + delivered @ (x, s)
-    resistor_factor: FloatArray  # (n_r, n): Factor f with k = f^T f
-    resistor_factor_s: FloatArray  # (n_r, n_s): f_s with b = f^T f_s of the voltage sources, zero for the others
+    # (n_s, n + n_s): The current that each source delivers (a V out of its p node, an I out of its n node) is through @
+    # i + delivered @ (x, s), with the currents i of the cells
+    delivered: FloatArray
+    # resistor_factor (n_r, n), resistor_factor_s (n_r, n_s): Factors f and f_s with k = f^T f and, in the columns of
+    # the voltage sources, b = f^T f_s; f_s is zero in the columns of the current sources
+    resistor_factor: FloatArray
+    resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
     nodes: FloatArray  # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources
-    stack: Stack | None = None  # Of a series loop: modes and phasors come from it, to full relative precision
-    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)  # Shared by those of other sources
+    # The series stack if this is its network: modes and phasors are then computed from it, to full relative precision
+    stack: Stack | None = None
+    # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
+    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def drives(self) -> tuple[tuple[Element, float], ...]:
@@ -182,7 +193,10 @@ class Network(Remembering):
 
 
 def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
-    """The network of a circuit, or its refusal; voltage sources `held` are added to hold nodes, and close no loop."""
+    """The network of a circuit, or its refusal.
+
+    The voltage sources in `held` are added, to hold the voltages of nodes; they may close no loop of voltage sources.
+    """
     areas, carrying = find_branches(circuit)
     branches = [*carrying, *held]
     problem = ".options work=total holds the voltage across a series stack, and this circuit is none; allowed: work=gap"
@@ -197,7 +211,8 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     assert all(taken[:n_v])
     live = [i for i in range(n_c) if taken[n_v + i]]
     n, n_e = len(live), len(live) + n_v
-    order = [*range(n_v, n_e), *range(n_v)]  # The tree's voltages are s, x and r, of sources, capacitors and resistors.
+    # The tree's branches are voltage sources, capacitors and resistors: their voltages are s, x and r.
+    order = [*range(n_v, n_e), *range(n_v)]
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
         """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""
@@ -256,10 +271,12 @@ class Modes(NamedTuple):
 
     rates: FloatArray  # (n,): 1/s; zero for a charge that no conductance drains
     gains: FloatArray  # (n, n_s)
-    shape: FloatArray  # (n, n)
-    inverse: FloatArray  # (n, n): v = inverse (x + follow s)
+    # shape, inverse (n, n): v = inverse (x + follow s)
+    shape: FloatArray
+    inverse: FloatArray
     follow: FloatArray  # (n, n_s): A jump ds of the sources changes x by -follow ds, and v not at all
-    take: FloatArray  # (n, n_cell): Currents j (A) through the cells beside their linear ones contribute -take j to v'
+    # (n, n_cell): Currents j (A) through the cells in addition to their linear ones contribute -take j to v'
+    take: FloatArray
 
 
 def network_modes(network: Network, area: FloatArray) -> Modes:
@@ -276,7 +293,8 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
     left, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T)
     rates, pushed = np.zeros(n), np.zeros((n, n_s))
     rates[: sigma.size] = sigma**2
-    rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0  # The rate of a charge that no conductance drains is round-off.
+    # The computed rate of a charge that no conductance drains is round-off.
+    rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0
     take = turned @ np.linalg.solve(lower, network.p.T)
     moved, shape = take @ (capacitance * network.q), np.linalg.solve(lower.T, turned.T)
     pushed[: sigma.size] = sigma[:, None] * (left[:, : sigma.size].T @ factor_s)
@@ -306,7 +324,8 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
 def checked(circuit: Circuit) -> Circuit:
     """The circuit, refused if a value is not allowed or it has no solution."""
     check(circuit)
-    (build_stack if statespace.loop_of(circuit) else network_of)(circuit)  # That of a stack follows from its cells.
+    # Of a stack the network follows from its cells, and cannot fail.
+    (build_stack if statespace.loop_of(circuit) else network_of)(circuit)
     return circuit
 
 
@@ -357,7 +376,10 @@ class LinearScene(NamedTuple):
 
 
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
-    """The linear scene of a GAP, which has to be named if there are several, of a circuit with one source."""
+    """The linear scene of a circuit's GAP, which has to be named if there are several.
+
+    Refused are names of no GAP, and networks with several sources, which have no common amplitude and frequency.
+    """
     gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
     known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
     require(finger is None or finger.lower() in gaps, "finger", repr(finger), f"the name of a GAP, {known}")

@@ -137,7 +137,8 @@ def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
     for walk in walks:
         if next(hop for hop in walk if hop.element.device == "V").sign < 0.0:
             return walk
-    # With opposed sources, the first one's p node may come first in both directions: the deck's first source decides.
+    # With opposed sources, the p node of the first source may come first in both directions: the deck's first source
+    # then decides.
     deciding = next(e for e in branches if e.device == "V")
     return next(walk for walk in walks if any(hop.element is deciding and hop.sign < 0.0 for hop in walk))
 
@@ -259,7 +260,8 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
     voltages = [e for e in branches if e.device == "V"]
     taken, _ = spanning_tree(e.nodes for e in voltages)
     if not all(taken):
-        e = voltages[taken.index(False)]  # There is one way through those before, from one end to the other.
+        # The sources before form no loop: there is one way through them from one end to the other.
+        e = voltages[taken.index(False)]
         came, names, node = _ways(voltages[: taken.index(False)], e.nodes[0]), list[str](), e.nodes[1]
         while (step := came[node]) is not None:
             names.append(step.name)
@@ -292,7 +294,8 @@ class Stack(Remembering):
     contact: Contact | None
     area_given: float | None  # Area fixed by the deck, m^2
     hops: tuple[Hop, ...]  # The elements of the loop in order, from ground to ground
-    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)  # Shared by those of other sources
+    # Whatever else is computed from the layers alone, shared by stacks that differ in their sources only
+    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:
@@ -393,7 +396,8 @@ def contact_of(gap: Element) -> Contact:
 
     def make() -> Contact:
         v = gap.values
-        with suppress(ArithmeticError, ValueError):  # A product may overflow, or underflow before its logarithm.
+        # A product may overflow, or a logarithm be taken of one that underflows.
+        with suppress(ArithmeticError, ValueError):
             alpha, beta, c2 = v["alpha"] * 1e-6, v["beta"] * 1e-6 * 1e3 ** v["n_exp"], v["c2"] * 1e-12
             contact = Contact(v["d"], v["eps_r"], v["fn"], v["mu"], alpha, v["m_exp"], beta, v["n_exp"], c2)
             if np.all(np.isfinite(contact.packed)):

@@ -36,7 +36,10 @@ _STATEMENT = re.compile(  #: Titles that are probably the netlist's first statem
 
 
 def parse_deck(text: str, path: Path | None = None) -> Deck:
-    """Read a netlist, whose first line is the title; files are included from the folder of its `path`, if given."""
+    """Read a netlist, whose first line is the title.
+
+    Files are included from the folder of `path`, that of the file with this text; without it, only native libraries.
+    """
     deck = Deck(text, path)
     refuse(not text.strip("\ufeff \t\r\n"), f"'{deck.file}' is empty: a netlist begins with a title line")
     refuse(len(text) > MAX_BYTES, f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
@@ -87,6 +90,7 @@ class _Instance:
         return self.ports.get(lower) or (f"{self.prefix}{lower}".lower(), f"{self.prefix}{name}")
 
     def nodes(self, words: list[Lexeme]) -> list[tuple[str, str]]:
+        """Canonical and written names of nodes."""
         for word in words:
             if word.kind != "word":
                 raise InputError(f"{word.written} stands where a node's name belongs", word.where)
@@ -163,6 +167,7 @@ class _Instance:
             _refuse_captured(native, given, words, scope)
             self.deck.statements.append(Statement(name, native, canonical, written, (), params, lexemes[0].where))
             return
+        # Count what the call expands to; refuse circles, and what is too deep or too much.
         for start, outer in enumerate(self.calls):
             if outer is called:
                 path = " -> ".join(sub.name for sub in (*self.calls[start:], called))
@@ -204,7 +209,8 @@ def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
     visible = [*layer_devices(), *(sub.name for subs in inner for sub in subs.values())]
     known = {name.lower() for name in visible}
     for word in words[2:-1]:
-        if word.text.lower() in known:  # Probably the device, and the words after it lack their `key=`.
+        # A device's name after two words or more is probably the device, and the words after it lack their `key=`.
+        if word.text.lower() in known:
             return f"{last.written} follows the device {word.text}: its parameters are written key=value"
     hint = nearest(last.text, visible) or f"; devices are {' '.join(visible[:40])}"
     return f"'{last.text}' is not a device or a .subckt{hint}"

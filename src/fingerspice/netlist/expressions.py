@@ -1,8 +1,9 @@
 """Values of a netlist's words: numbers, keywords, and arithmetic such as `{2*d + 1u}` of parameters.
 
 From loose to tight an expression has `a ? b : c`, `||`, `&&`, comparisons, `+ -`, `* /`, signs, and `^` or `**`.
-Functions are those of ngspice's `.param`, with `log` the natural logarithm, and `pi`, `e`, `atan2` and `hypot`, which
-ngspice 39 lacks. An expression that ngspice and mathematics read differently (`2^3^2`, a negative base) is refused.
+Functions have the same meaning as in ngspice's `.param`; `log` is the natural logarithm. An expression that ngspice and
+mathematics read differently (`2^3^2`, a negative base) is refused. ngspice 39 does not know `pi`, `e`, `atan2` and
+`hypot`.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ def _pwr(base: float, exponent: float) -> float:
 
 
 _AS_IN_MATH = "sqrt exp log10 sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh floor ceil"
-FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {  #: By name the function, and its number of arguments.
+#: From a name to the function, and its number of arguments.
+FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {
     **{name: (getattr(math, name), 1) for name in _AS_IN_MATH.split()},
     "ln": (math.log, 1), "log": (math.log, 1), "arctan": (math.atan, 1), "abs": (abs, 1), "sqr": (lambda x: x * x, 1),
     "sgn": (lambda x: (x > 0.0) - (x < 0.0), 1), "int": (math.trunc, 1), "nint": (round, 1), "min": (min, 2),
@@ -125,6 +127,7 @@ class Expression:
         self._pieces.clear()
 
     def _take(self, *texts: str) -> _Piece | None:
+        """The next piece if it is one of these."""
         piece = self._pieces[self._at]
         if piece.text not in texts:
             return None
@@ -371,7 +374,8 @@ class Scope:
             for name in filter(texts.__contains__, TopologicalSorter(graph).static_order()):
                 self.preset(name, self.number(texts[name]))
         except CycleError as error:
-            circle = error.args[1][:0:-1]  # From a parameter to those in its definition: graphlib goes backwards.
+            # From a parameter to those in its definition, which graphlib gives backwards.
+            circle = error.args[1][:0:-1]
             path = [circle[-1], *circle]
             shown = [self._definitions[name].key.text for name in path]
             if len(shown) > 12:

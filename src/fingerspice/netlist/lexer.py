@@ -186,7 +186,8 @@ def lex(line: Line, start: int = 0) -> list[Lexeme]:
 def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Group:
     """Sort the lexemes after a line's first word into words, calls and `key=value` pairs.
 
-    The first `plain` words are nodes, which may hold brackets. With `probes`, `v(node)=value` has the key ``v(node)``.
+    The first `plain` words are nodes, which may stand in brackets without being calls. With `probes`, `v(node)=value`
+    is a pair with the key ``v(node)``.
     """
     top = Group()
     inside, brackets = top, list[tuple[Lexeme, Group]]()

@@ -121,7 +121,8 @@ def _unusual(deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initi
 def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Waveform:
     """A waveform from netlist text such as ``SQUARE(200 100)`` or ``WAVEFILE(a.wav 150)``.
 
-    SPICE's defaults come from the circuit's .tran. Files, relative to the working folder, are read only with `files`.
+    SPICE's defaults come from the circuit's .tran, and file names are relative to the working directory. Without
+    `files`, for a text from elsewhere, no file is read.
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""

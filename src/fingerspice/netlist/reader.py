@@ -1,4 +1,7 @@
-"""Files of a netlist, in its own folder, and its lines sorted into elements, parameters, subcircuits and directives."""
+"""Files of a netlist, and its lines sorted into elements, parameters, subcircuits and directives.
+
+Files may be in the netlist's own folder; the libraries of native devices are those shipped.
+"""
 
 from __future__ import annotations
 
@@ -292,6 +295,7 @@ class Deck:
             kept.append(f"{where}: {message}")
 
     def _take(self, line: Line) -> None:
+        """Enter one line in its list."""
         here, word = self._open[-1], line.text.split(None, 1)[0].lower()
         if self._control is not None:
             if word == ".endc":

@@ -22,7 +22,8 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import AM, Sine, Waveform, require
 
-WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}  #: Waveforms of drives, by name.
+#: Waveforms of drives, by the name that a set gives.
+WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}
 _PREFIXED = ("m", "ohm", "V", "Hz", "N")  #: Units that take a prefix in tables.
 DATA = Path(__file__).with_name("data")
 #: Where a work is found, by BibTeX's names, with the words before them in a sentence.
@@ -292,7 +293,8 @@ def quantity(value: float, unit: str) -> str:
 
 
 _MODEL = "Forsbach2021"  #: The paper whose model is simulated.
-_METHODS = {"scipy": "SciPy", "torchdiffeq": "torchdiffeq"}  #: Programs that integrated, by the method's first part.
+#: Programs that integrated the run, by the part of the method's name before the colon.
+_METHODS = {"scipy": "SciPy", "torchdiffeq": "torchdiffeq"}
 
 
 @dataclass(frozen=True, repr=False)

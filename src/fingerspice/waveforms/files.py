@@ -73,7 +73,10 @@ class Columns:
         return f"{count} column{'s' if count > 1 else ''} {called}"
 
     def index(self, column: str | int | None, role: str, most: int, default: int) -> int:
-        """Index of a column given by its name or number; else the default, which at most `most` columns have."""
+        """Index of a column given by its name, of which there has to be one, or by its number; else the default.
+
+        A table of more than `most` columns has no default for the role.
+        """
         count = self.data.shape[1]
         if column is None:
             way = "name the column" if self.names else "the number of the column"
@@ -158,7 +161,8 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     try:
         lines = data.decode("utf-16" if wide else "utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        lines = data.decode("cp1252", "replace").splitlines()  # Latin-1 of Windows, as spreadsheets and LTspice write.
+        # Windows' Latin-1, in which spreadsheets and LTspice write the micro sign.
+        lines = data.decode("cp1252", "replace").splitlines()
     lines = [_COMMENT.sub(r"\1", line) if ";" in line else line for line in lines]
     steps = [(number, line) for number, line in enumerate(lines, 1) if line.startswith(_STEPPED)]
     if len(steps) > 1:

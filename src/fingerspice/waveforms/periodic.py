@@ -1,4 +1,7 @@
-"""Waveforms of straight pieces: PWL, square, triangle, sawtooth, pulses; and stretches used once or repeated."""
+"""Waveforms of straight pieces: PWL, square, triangle, sawtooth, pulses; and stretches that are used once or repeated.
+
+The base class of straight pieces is `Ramps`, of which a subclass only lists its knots.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,8 @@ def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]
 class Ramps(Waveform):
     """Straight lines between knots (t, v), constant outside them or repeated; two knots at one time are a jump.
 
-    Of a periodic subclass the `knots` from the time `_first` on span one period and are repeated; earlier ones are not.
+    Subclasses have `knots`. The knots of a periodic one from the time `_first` on span one period and are repeated for
+    ever; earlier knots occur once.
     """
 
     _first: float = 0.0  # Time (s) from which the waveform is periodic
@@ -107,21 +111,24 @@ class Ramps(Waveform):
         times, values = self.knots
         if self.period is not None:
             edges = self._edges(flat.min(), flat.max())
-            far = 1.0 + 2.0 * np.abs(edges[[0, -1]])  # Times before the first edge and behind the last one.
+            # Any time before the first edge, for what comes before it, and any time behind the last one.
+            far = 1.0 + 2.0 * np.abs(edges[[0, -1]])
             bounds = np.concatenate([-far[:1], edges, far[1:]])
             index = edges.searchsorted(flat, "right" if side == "right" else "left")
             v0, slope = self._line(bounds[index], bounds[index + 1])
             return np.asarray(v0 + slope * (flat - bounds[index]))
         out = np.interp(flat, times, values)
         if side == "left":
-            j = np.minimum(times.searchsorted(flat), times.size - 1)  # At a knot its own value, the first at a jump.
+            # At a knot its own value, and at a jump that of the first of two knots.
+            j = np.minimum(times.searchsorted(flat), times.size - 1)
             out = np.where(times[j] == flat, values[j], out)
         return out
 
     def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Values (V) at `start` and slopes (V/s) of the straight pieces between `start` and `stop` (s)."""
         times, values = self.knots
-        middle = 0.5 * (start + stop)  # It identifies a piece: rounding cannot move it into a neighbour.
+        # A piece is identified by its midpoint, which rounding cannot move into a neighbour.
+        middle = 0.5 * (start + stop)
         run = np.zeros(1)
         if self.period is not None:
             run = self._origin + np.maximum(np.floor((middle - self._first) / self.period), 0.0) * self.period
@@ -271,7 +278,8 @@ class _Periodic(Ramps):
         return np.array(x) * self.period, self.offset + self.amplitude * np.array(y)
 
     def _times(self, t0: float, t1: float) -> FloatArray:
-        x = self.knots[0] * self.frequency  # (k + x) / f is rounded to the same double as the time that a user writes.
+        # Computed as (k + x) / f, an edge is rounded to the same double as the time that a user writes for it.
+        x = self.knots[0] * self.frequency
         runs = runs_through(1.0 / self.frequency, x.size, t0, t1, self._shift)
         return np.asarray(((runs + x) / self.frequency + self._shift).ravel())
 

@@ -18,7 +18,8 @@ from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, 
 from fingerspice.waveforms.periodic import FEW_KNOTS, PWL, Ramps
 from fingerspice.waveforms.waveform import DC, RANGES, Product, Sum, Waveform, check_range, require
 
-_WING, _BETA = 32, 8.0  # Filter's half-width in samples, beta of its Kaiser window: gain 1 within 0.02 % to 0.46 rate
+# Half-width of the filter in samples, beta of its Kaiser window: the gain is 1 within 0.02 % up to 0.46 of the rate.
+_WING, _BETA = 32, 8.0
 AT_ONCE = 1 << 20  # Number of samples of a file that are read at once.
 ON_GRID, ROUNDING = 1e-9, 1e-15  # Largest distance of a time from the grid, in spacings, and its own rounding.
 MOST_PER_POINT = 8  # Grid samples for each point of a PWL: beyond it, few long lines are faster taken one by one.
@@ -41,7 +42,8 @@ class Samples(Ramps):
     values: FloatArray
     rate: Hertz
     start: Second = 0.0
-    _number: ClassVar[int] = 0  # Number of `values[0]` in the whole recording, whose sample 0 is at `start`.
+    # Number of the sample `values[0]` in the whole recording, whose sample number 0 is at `start`.
+    _number: ClassVar[int] = 0
     count: ClassVar[int]  #: Number of samples
 
     def __post_init__(self) -> None:
@@ -127,7 +129,8 @@ class Samples(Ramps):
         check_count("the upsampled recording", factor * self.count)
         taps = firwin(2 * _WING * factor + 1, 1.0 / factor, window=("kaiser", _BETA))
         dense = resample_poly(self.values, factor, 1, window=taps, padtype="edge")[: (self.count - 1) * factor + 1]
-        dense[::factor] = self.values  # The finite window is slightly inexact at the given samples.
+        # The finite window makes the filter slightly inexact at the given samples: restore them.
+        dense[::factor] = self.values
         return Samples(dense, factor * self.rate, self.start)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -181,7 +184,8 @@ class Samples(Ramps):
 
     @property
     def course(self) -> tuple[float, float]:  # type: ignore[override]
-        return self.start, self.start + (self.count - 1) / self.rate  # Not by the values, maybe in a file of an hour.
+        # Not from the values, which may lie in a file of an hour.
+        return self.start, self.start + (self.count - 1) / self.rate
 
     @cached_property
     def knots(self) -> tuple[FloatArray, FloatArray]:
@@ -200,6 +204,7 @@ class Samples(Ramps):
         return peak
 
     def breakpoint_rate(self) -> float:
+        # The rate is only used to divide time into windows; so few breakpoints need none.
         return 0.0 if self.count <= FEW_KNOTS else self.count / ((self.count - 1) / self.rate)
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
@@ -292,7 +297,8 @@ def _of_parts(wave: Sum | Product) -> Samples | None:
     if any(part.rate != rate for part in parts) or any(abs(x - round(x)) > ON_GRID for x in begins):
         return None
     end = max(round(x) + part.count for x, part in zip(begins, parts, strict=True))
-    if end > MOST_PER_POINT * sum(part.count for part in parts):  # Far apart they would be mostly constant samples.
+    # Recordings far apart would make a grid of mostly constant samples.
+    if end > MOST_PER_POINT * sum(part.count for part in parts):
         return None
     total = np.full(end, float(sum(constants)))
     for x, part in zip(begins, parts, strict=True):

@@ -192,7 +192,8 @@ def source_table(
     if terms is not None:
         if not (no_chirps and np.any(terms[:, :, 5] != 0.0)):
             return SourceTable(between, np.ascontiguousarray(terms), np.zeros((between.size - 1, 0)))
-        edges, step = between, 0.1 * waveform.shortest_time()  # Not the outputs' step: no result depends on it.
+        # The output step is not used here, so that no result depends on the outputs asked for.
+        edges, step = between, 0.1 * waveform.shortest_time()
     pieces = Refiner(waveform, tol, step, [float(t0)], shortest, scale)
     for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
@@ -213,7 +214,8 @@ _NODE_STEPS = np.diff(_PLACES[:POINTS])
 _LONGEST = 8.0
 WIDEST = 0.5 * _LONGEST * float(np.diff(np.sort(_PLACES)).max())
 
-# After `_IDLE` halvings that do not reduce it, a misfit below `_ROUGHEST` (of the largest |U|) is taken for round-off.
+# After `_IDLE` halvings in a row that do not reduce the misfit, a misfit below `_ROUGHEST` (relative to the largest
+# |U|, for values in doubles) is taken for round-off of the function's values.
 _IDLE, _ROUGHEST = 3, 1e-8
 _STEEP = 0.05  # Least change over short series, relative to the largest |U|, that is told as an edge; a kink has less.
 _NOTHING = 1e-290  # Smallest tolerance, V: below it doubles are nearly denormal, and no function appears smooth.
@@ -254,7 +256,8 @@ class Refiner:
     scale: float = 0.0  # Largest |U| (V) seen
     steepest: float = 0.0  # Largest |dU/dt| (V/s) seen
     series: list[FloatArray] = field(default_factory=list)  # (POINTS,): Chebyshev coefficients on each interval
-    jumps: list[tuple[float, float, bool]] = field(default_factory=list)  # Time (s), difference (V), whether bisected
+    # Times (s) at which neighbouring series differ, the difference (V), and whether bisection found the jump
+    jumps: list[tuple[float, float, bool]] = field(default_factory=list)
     narrow: list[float] = field(default_factory=list)  # Times (s) of intervals much shorter than the output step
     short: list[tuple[float, float]] = field(default_factory=list)  # Start (s) of each short interval, its change (V)
     not_finite: float | None = None  # Time (s) of the first NaN or inf
@@ -284,7 +287,9 @@ class Refiner:
                 if piece.depth > _DEEP:
                     self._refuse_noise(piece, values)
                 if idle >= _IDLE and misfit <= self._roughest:
-                    self.rough = max(self.rough, misfit)  # Halving a smooth misfit divides it by 2^20, a kink's by 2.
+                    # Halving divides the misfit of a smooth function by 2^20 and the misfit at a kink by 2. A misfit
+                    # that halving does not reduce is round-off of the function's own values.
+                    self.rough = max(self.rough, misfit)
                     series = chebyshev.coefficients(values)
             floor = max(4e-15 * max(abs(lo), abs(hi)), 1e-13 * self.step)
             if series is not None:
@@ -305,7 +310,8 @@ class Refiner:
             if piece.largest > self._roughest:
                 self.narrow.append(0.5 * (piece.lo + piece.hi))
         if self.series and not first and not (self.jumps and self.jumps[-1][0] >= piece.lo):
-            # A jump or a steep edge may lie exactly on a cut, where neither interval's points show it: refine both.
+            # A jump or a steep edge may lie exactly on a cut, so that the points of neither interval show it: refine
+            # both intervals until they are short.
             change = float(series @ _AT_START - self.series[-1].sum())
             if abs(change) > self._least and piece.hi - piece.lo > floor:
                 again = piece.halves()
@@ -382,7 +388,8 @@ class Refiner:
         known += [] if self.not_finite is None else [self.not_finite]
         apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
         if self.short:
-            start, change = np.array(self.short).T  # The first edge: a sum over `_STEEP` in a tenth of a step.
+            # The first edge: short series whose change sums to more than `_STEEP` in a tenth of a step.
+            start, change = np.array(self.short).T
             total = np.concatenate([[0.0], np.cumsum(change)])
             after = np.searchsorted(start, start + 0.1 * self.step)
             steep = np.flatnonzero(np.abs(total[after] - total[:-1]) > _STEEP * self.scale)

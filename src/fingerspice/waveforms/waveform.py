@@ -33,7 +33,8 @@ TAU = 2.0 * math.pi
 _SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.6180339887498949)[0]) / 512.0, 1.0)
 DOUBLE = 2.0**-52  #: Distance of neighbouring doubles, relative to their size.
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
-MOST_CYCLES, _ROUNDING = 10**6, 2e-15  #: Most cycles in a common period, largest relative rounding of periods' ratios
+#: Most cycles of a part in a common period, and the largest relative rounding error of a ratio of two periods.
+MOST_CYCLES, _ROUNDING = 10**6, 2e-15
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,8 @@ class Waveform(Remembering):
         size = np.abs(self.value(t))
         quick = self.shortest_time()
         if quick < (t1 - t0) / 4.0:
-            # Of a carrier, look at whole cycles where its amplitude, by values a quarter of one apart, is largest.
+            # A carrier is sampled too coarsely: its amplitude follows from values a quarter of a cycle apart. Look at
+            # whole cycles where that is largest.
             amplitude = np.hypot(size, self.value(np.minimum(t + 0.25 * quick, t1)))
             about = t[np.argsort(amplitude)[-8:], None] + quick * np.linspace(-0.5, 0.5, 65)
             size = np.append(size, np.abs(self.value(np.clip(about, t0, t1))))
