@@ -242,7 +242,7 @@ def test_a_parameter_near_whose_value_there_is_no_period_is_refused_in_a_periodi
     with pytest.raises(InputError, match=r"Vdrive\.modulation, near whose value the source has no such period"):
         fs.simulate(circuit, t_stop=0.02, start="periodic", sensitivities=("Xgap.d", "Vdrive.modulation"))
     # When it is asked for, not when the run of a period is looked at.
-    with pytest.raises(InputError, match="nearest: 'Xgap.d'"):
+    with pytest.raises(InputError, match=r"nearest: 'Xgap\.d'"):
         fs.steady_state(circuit, sensitivities=("Xgap.dd",))
 
 
