@@ -40,7 +40,7 @@ figures: $(VENV)/.run
 
 test: $(VENV)/.test
 	@sh tests/get_programs.sh
-	@echo "running the whole suite: about 12 minutes on two cores, a quarter of it for the compiler"
+	@echo "running the whole suite: 7 minutes on two cores, and about 3 more where nothing is compiled yet"
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
 
 stress: $(VENV)/.test
