@@ -312,12 +312,13 @@ def _ahead(problem: Problem, run: Run, rtol: float) -> tuple[bool, _Path | None]
 
 def _path(problem: Problem, t: float, y: FloatArray, sources: Sources, u: float, rtol: float) -> _Path | None:
     """The path from the loop's state y at t (s), with the gap voltage u (V), to a fold; None where it meets none."""
+    from scipy.integrate import solve_ivp
+
     model, n, sign = model_of(problem.scene), y.size, math.copysign(1.0, u)
     index, s, ds = segment_index(sources, t, "right"), np.empty(1), np.empty(1)
     start, stop = sources.edges[index[0] : index[0] + 2]
     pace = model.tau if math.isfinite(model.tau) else stop - start
-    scale = np.full(n + 2, max(np.abs(y[:-1]).max(), abs(u)))
-    scale[n - 1 :] = model.area0 / model.s * abs(u), pace, abs(u)
+    scale = np.append(np.full(n - 1, max(np.abs(y[:-1]).max(), abs(u))), [model.area0 / model.s * abs(u), pace, abs(u)])
     dy, left = np.empty(n), MOST_EVALUATIONS
 
     def at(z: FloatArray) -> tuple[float, float]:
@@ -339,13 +340,12 @@ def _path(problem: Problem, t: float, y: FloatArray, sources: Sources, u: float,
         here, steps = slope(s, z), np.diag(1e-7 * np.abs(z) + 1e-13)
         return np.array([(slope(s, z + step) - here) / ((z + step)[i] - z[i]) for i, step in enumerate(steps)]).T
 
-    from scipy.integrate import solve_ivp
-
     begin = np.concatenate([y, [0.0, u]]) / scale
     far = 3.0 * at(begin)[0]
-    # At the fold, at the end of the segment, and too far from the fold again.
+    # At the fold, where the gap voltage leaves its branch, at the end of the segment, and too far from the fold again.
     events: list[Any] = [
-        lambda _, z: at(z)[0] - NOTHING_LEFT, lambda _, z: stop - t - float(z[n]) * pace, lambda _, z: far - at(z)[0]
+        lambda _, z: at(z)[0] - NOTHING_LEFT, lambda _, z: sign * float(z[n + 1]),
+        lambda _, z: stop - t - float(z[n]) * pace, lambda _, z: far - at(z)[0],
     ]  # fmt: skip
     for event in events:
         event.terminal = True
