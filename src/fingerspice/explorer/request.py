@@ -390,9 +390,9 @@ def _parsed(text: str) -> fs.Circuit:
 
 def _dispersive(circuit: fs.Circuit) -> fs.Circuit:
     """The circuit with the data of every skin at all frequencies."""
+    of = {e.name: MappingProxyType({"d": e.values["d"]}) for e in circuit.by_device("SKIN")}
     wide = partial(replace, device="SKIN_DISPERSIVE")
-    elements = (wide(e, values={"d": e.values["d"]}) if e.device == "SKIN" else e for e in circuit.elements)
-    return replace(circuit, elements=tuple(elements))
+    return replace(circuit, elements=tuple(wide(e, values=of[e.name]) if e.name in of else e for e in circuit.elements))
 
 
 def _unknown(kind: str, name: str, known: Iterable[str]) -> str:
