@@ -19,10 +19,10 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along.
-ALL_LINES = 35_494
+ALL_LINES = 35_491
 ALL_FILES = 129
 PACKAGE_LINES = {
-    "base": 1_028, "circuit": 2_011, "cli": 1_456, "engine": 7_829, "explorer": 1_184, "netlist": 2_059,
+    "base": 1_028, "circuit": 2_011, "cli": 1_456, "engine": 7_826, "explorer": 1_184, "netlist": 2_059,
     "numerics": 1_198, "physics": 453, "plots": 1_212, "results": 2_426, "sets": 361, "solve": 5_505,
     "studies": 5_998, "torch": 383, "waveforms": 2_242,
 }  # fmt: skip

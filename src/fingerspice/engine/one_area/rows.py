@@ -232,13 +232,10 @@ def probe_one(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
 @jit
 def _solve_mobile(system: System, sign: float, r: FloatArray) -> bool:
     """u = k U + b q(u) at all rows at once, by Newton; r[U] holds k U + x on entry."""
-    powers, lo, scale, area0, size = system.powers, system.lo, system.scale, system.model.area0, 0.0
-    # A longer series has larger rounding errors.
-    rounding = 1e-15 if powers.size == DEGREE + 1 else 2e-13
+    powers, lo, scale, area0 = system.powers, system.lo, system.scale, system.model.area0
     for i in range(ROWS):
         r[FREE, i] = r[U, i] - r[X_GAP, i]
         r[U, i] = r[GUESS, i]
-        size = max(size, abs(r[FREE, i]) + abs(r[X_GAP, i]))
     for _ in range(30):
         if scale > 0.0:
             polynomial_rows(powers, lo, scale, r[U], sign, r[Q])
@@ -247,9 +244,9 @@ def _solve_mobile(system: System, sign: float, r: FloatArray) -> bool:
                 r[DQ, i] *= scale * sign
         else:
             _long_area(system.model.curve, sign, r)
-        worst = 0.0
-        lowest = 1.0
+        worst, size, lowest = 0.0, 0.0, 1.0
         for i in range(ROWS):
+            size = max(size, abs(r[FREE, i]) + abs(r[U, i]))
             b = r[X_GAP, i] * area0
             margin = 1.0 - b * r[DQ, i]
             step = (r[U, i] - r[FREE, i] - b * r[Q, i]) / margin
@@ -259,8 +256,8 @@ def _solve_mobile(system: System, sign: float, r: FloatArray) -> bool:
         # Beyond the fold the slope has changed its sign: such a root is not connected to the uncharged state.
         if not lowest > 0.0 or not worst < math.inf:
             return False
-        # Close to the fold the error of the voltage is rounding error over the distance to the fold.
-        if worst * lowest <= rounding * size:
+        # What is left after a step falls with its square. Close to the fold, rounding is divided by the distance to it.
+        if worst * lowest <= 2e-13 * size:
             return True
     return False
 
