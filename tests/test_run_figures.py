@@ -13,7 +13,6 @@ from scipy.integrate import simpson
 import analytic as ref
 import fingerspice as fs
 from fingerspice.results import steps
-from fingerspice.results.summary import Figures
 from scenes import cases, deck, every_law, listed, shipped, table1
 
 AREA = 34.9715871843e-6
@@ -212,7 +211,7 @@ def test_figures_are_the_same_whatever_tstep(law: str, source: str, name: str) -
     assert all(other == seen[0] for other in seen[1:])
     # And a much tighter run of many outputs, by parabolas through them, gives the same.
     fine = run(np.linspace(0.0, 3e-3, 60_001), 1e-10)
-    for key in (key for key in fine._figures.shown if key.startswith(("u_gap", "f_el"))):
+    for key in (key for key in fine._shown if key.startswith(("u_gap", "f_el"))):
         x = fine.record.one(key)
         error = fine.error.u_gap + 1e-7 * np.abs(x).max()
         assert abs(seen[0][f"{key}_max"] - x.max()) <= 3e-6 * np.ptp(x) + error
@@ -293,7 +292,8 @@ def test_weights_of_outputs_integrate_cubics_between_jumps_and_lines_where_point
 @pytest.mark.parametrize("area", ["coupled", "frozen"])
 def test_every_attribute_is_the_summarys_entry_whichever_is_asked_for_first(area, monkeypatch):
     made = []
-    monkeypatch.setattr(Figures, "_made", lambda self, *key, make=Figures._made: made.append(key) or make(self, *key))
+    make = fs.Solution._made
+    monkeypatch.setattr(fs.Solution, "_made", lambda self, *key: made.append(key) or make(self, *key))
     run, other = (fs.simulate(table1(), area=area, t_stop=0.02) for _ in range(2))
     assert run.f_el_mean == run.f_el_mean
     assert made == [("f_el", "mean")]

@@ -74,7 +74,7 @@ def parts(given: dict[str, Any], own: fs.Circuit | None = None) -> Iterator[dict
             rest |= {
                 "figures": [
                     {key: trace[key] for key in ("name", "label", "element", "unit")}
-                    | {figure: solution._figures.value(trace["name"], figure) for figure in _FIGURES}
+                    | {figure: solution._figure(trace["name"], figure) for figure in _FIGURES}
                     for trace in answer["traces"]
                 ],
                 "harmonics": _harmonics(solution, answer["period"]),

@@ -248,7 +248,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             file.attrs.update(solution.provenance())
             group = file.create_group(GROUP)
             circuit, arrays = stored_circuit(solution.circuit, solution.t_stop, solution.rtol)
-            between = solution._figures.between()
+            between = solution._between()
             run = {"format": FORMAT, **{name: plain(getattr(solution, name)) for name, (plain, _) in _PLAIN.items()}}
             run |= {
                 "sources": list(solution.sources), "signals": list(solution.signals),

@@ -1,9 +1,10 @@
-"""The result of a run: read-only signals with their status, error and provenance; and derivatives of it."""
+"""The result of a run: read-only signals, figures, status, error and provenance; and derivatives of it."""
 
 from __future__ import annotations
 
+import cmath
 import json
-from copy import copy
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -11,12 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, Remembering, read_only
 from fingerspice.base.files import write_csv
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.base.units import format_si
+from fingerspice.circuit.describe import head_lines
+from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.outcome import ErrorEstimate, Failure, Plan, State, Status
-from fingerspice.results.record import Sealed, Signalled, Signals, kept_rows, variables
-from fingerspice.results.summary import Figured, Figures
+from fingerspice.results.record import Sealed, Signalled, Signals, attribute, kept_rows, signal_of, variables
+from fingerspice.results.steps import Outputs, Stretch
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -35,6 +39,16 @@ if TYPE_CHECKING:
 
 DERIVED = ("u_gap", "area", "f_el", "f_t", "friction")  # Signals and means that have derivatives
 MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
+MOST_BETWEEN = 2_000_000  # Most numbers of the last period between the outputs that a file keeps (16 MB)
+# The signals in it, and how far they may be from their polynomials, relative to their peaks.
+_BETWEEN, _MISSED = ("u_source", "u_layer", "v", "u_gap", "area", "f_el", "fold_margin"), 1e-10
+#: Signals that have rows in the table, in their order, and its columns of figures: heading and kind.
+_ROWS = ("u_source", "u_gap", "u_layer", "v", "f_el", "f_t", "friction", "area")
+_COLUMNS = {
+    "min": "min", "max": "max", "mean": "mean", "last period": "mean_periodic", "rms": "rms_periodic",
+    "ripple": "ripple",
+}  # fmt: skip
+Value = float | FloatArray | None
 
 
 @dataclass(frozen=True, repr=False)
@@ -99,8 +113,34 @@ class SampleGradient(Sealed):
         return f"SampleGradient({self.source}: {told})"
 
 
+def figure(key: str, kind: str, doc: str) -> Value:
+    """A property of a result that has a method `_figure`: a figure of a signal."""
+    return attribute(lambda result: result._figure(key, kind), doc=doc)  # type: ignore[no-any-return]
+
+
+class Figured:
+    """A result with figures: each is a number, an array (n_gap,) with several gaps, or None where it does not exist.
+
+    Figures are integrals and extremes of the run itself, not of its outputs.
+    """
+
+    f_el_mean = figure("f_el", "mean", "Mean electroadhesive force over the run, N.")
+    f_el_mean_periodic = figure("f_el", "mean_periodic", "Mean of `f_el` over the last period, N; None without one.")
+    f_el_peak = figure("f_el", "peak", "Largest electroadhesive force, N.")
+    f_t_mean = figure("f_t", "mean", "Mean friction force over the run, N.")
+    f_t_mean_periodic = figure("f_t", "mean_periodic", "Mean of `f_t` over the last period, N; None without one.")
+    friction_mean = figure("friction", "mean", "Mean friction coefficient over the run.")
+    area_mean = figure("area", "mean", "Mean ridge contact area over the run, m^2.")
+    u_gap_peak = figure("u_gap", "peak", "Largest modulus of the gap voltage, V.")
+    u_gap_rms = figure("u_gap", "rms", "Root of the mean square of the gap voltage over the run, V.")
+    u_gap_amplitude = figure(
+        "u_gap", "amplitude", "Amplitude of `u_gap` at the fundamental, over the last period, V; None without one."
+    )
+    u_gap_phase_deg = figure("u_gap", "phase_deg", "Phase of `u_gap` at the fundamental, relative to a sine, degrees.")
+
+
 @dataclass(frozen=True, repr=False)
-class Solution(Sealed, Shown, Signalled, Figured):
+class Solution(Remembering, Sealed, Shown, Signalled, Figured):
     """Time response of a circuit.
 
     Signals are read-only arrays in SI units, computed when they are first asked for. A jump of the source has two rows
@@ -169,7 +209,33 @@ class Solution(Sealed, Shown, Signalled, Figured):
     sensitivities: Mapping[str, Sensitivity] = field(default_factory=dict)
 
     def _page(self) -> Page:
-        return self._figures.page()
+        """The figures as a table, and below it errors, the distance to the fold, and how the run ended."""
+        s, error = self.summary(), self.error
+        end = format_si(float(self.t[-1]), "s") if self.t.size else "nothing"
+        how = f"charge law {self.charge_law}, area {self.area_mode}, method {self.method}, rtol {self.rtol:g}"
+        out: list[str | Table] = [*head_lines(self.circuit), f"{end} simulated; {how}", ""]
+        if self.t.size >= 2:
+            names = [name for key in _ROWS for name in self.record.names(key) if f"{name}_max" in s]
+            out.append(Table(("", *_COLUMNS), [_row(name, s) for name in names]))
+            if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
+                out += ["last period: the mean over it; rms and ripple (max - min) are those of the last period, too"]
+            if "u_gap_amplitude" in s:
+                lead = (s["u_gap_phase_deg"] - s["u_source_phase_deg"] + 180.0) % 360.0 - 180.0
+                share = s["u_gap_amplitude"] / s["u_source_amplitude"] if s["u_source_amplitude"] else math.nan
+                told = f"at {format_si(s['fundamental'], 'Hz')}: gap voltage {format_si(s['u_gap_amplitude'], 'V')}"
+                out += ["", f"{told}, {100.0 * share:.2f} % of the source, leading by {lead:.2f} deg"]
+        of = "gap" if self.gaps else "layer" if self.layers else "capacitor"
+        told = f"estimated error: {of} voltage {error.u_gap:.2g} V"
+        told = f"{told}, force {error.f_el:.2g} N" if self.gaps else f"no GAP, no forces; {told}"
+        out += ["", told if error.v_nodes is None else f"{told}, node voltages {error.v_nodes:.2g} V"]
+        if s.get("figures_from") == "outputs":
+            out.append("figures are those of the outputs: what lies between them is not known")
+        if self.charge_law == "mobile" and "fold_margin_min" in s:
+            out.append(f"distance to the fold: {s['fold_margin_min']:.3g} at least (1 far, 0 at the fold)")
+        out.append(f"status: {self.message}")
+        if self.failure is not None and self.failure.tried:
+            out += ["", "last steps tried:", self.failure.history()]
+        return Page(out)
 
     @property
     def message(self) -> str:
@@ -181,13 +247,90 @@ class Solution(Sealed, Shown, Signalled, Figured):
         """Whether the run reached its end with the error met."""
         return self.status is Status.SUCCESS
 
-    @cached_property
-    def _figures(self) -> Figures:
-        # Of a copy, as two objects that hold each other stay in memory until Python looks for such cycles.
-        return Figures(copy(self))
+    def _figure(self, key: str, kind: str) -> Value:
+        """A figure of a signal, as in `summary`: a number, an array of several gaps or sources, or None."""
+        values = [self._one(name, kind) for name in self.record.names(key)]
+        if len(values) < 2:
+            return values[0] if values else None
+        return None if None in values else read_only(np.array(values, float))
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in vars(self).items() if key != "_figures"}
+    def _one(self, name: str, kind: str) -> float | None:
+        if self.stored is not None:
+            return self.stored.get(f"{name}_{kind}")
+        return self.remember((name, kind), lambda: self._made(name, kind))
+
+    def _made(self, name: str, kind: str) -> float | None:
+        kind, periodic, _ = kind.partition("_periodic")
+        span = self._last if periodic or kind in ("ripple", "amplitude", "phase_deg") else self._whole
+        if span is None:
+            return None
+        if kind in ("mean", "rms"):
+            return span.weigh(name).mean() if kind == "mean" else math.sqrt(span.weigh(name).mean(2))
+        if kind in ("amplitude", "phase_deg"):
+            if self.fundamental is None:
+                return None
+            p = span.weigh(name).phasor(self.fundamental.frequency)
+            return abs(p) if kind == "amplitude" else math.degrees(cmath.phase(p))
+        low, high = self.remember((name, span is self._whole), lambda: span.extremes(name))
+        figures: dict[str, float] = {"min": low, "max": high, "peak": max(high, -low), "ripple": high - low}
+        return figures[kind]
+
+    def _stretch(self, since: float, until: float) -> Stretch | None:
+        """The run between two times (s); None where it is not known between its outputs."""
+        run = None if self.continuous is None else self.continuous.run(self._shown, since, until)
+        return None if run is None else Stretch(run, since, until, self.rtol)
+
+    @cached_property
+    def _whole(self) -> Stretch | Outputs | None:
+        """The run from TSTART to its end; None where there are no outputs."""
+        return self._stretch(self.first, self.t_stop) or (None if self.t.size < 2 else Outputs(self.record))
+
+    @cached_property
+    def _last(self) -> Stretch | Outputs | None:
+        """The last period of the source; None where the run holds none."""
+        if self.period is None or not self.t.size:
+            return None
+        since = self.t_stop - self.period
+        if self.continuous is None or since < self.first - 1e-9 * self.period:
+            return self._last_outputs
+        if since <= self.first + 1e-9 * self.period:
+            return self._whole
+        return self._stretch(since, self.t_stop) or self._last_outputs
+
+    @cached_property
+    def _last_outputs(self) -> Outputs | None:
+        """The outputs of the source's last period; None where they are too few."""
+        assert self.period is not None
+        tolerance = 1e-9 * self.period
+        t, start = self.t, float(self.t[-1] - self.period)
+        if start < t[0] - tolerance or np.count_nonzero(t >= start) < 8:
+            return None
+        first, after = (int(i) for i in np.searchsorted(t, [start - tolerance, start + tolerance], side="right"))
+        # Of two outputs at a jump, the period starts with the right-hand one.
+        exact = abs(t[first] - start) <= tolerance
+        return Outputs(self.record, after - 1) if exact else Outputs(self.record, first, start)
+
+    def _between(self) -> tuple[list[str], FloatArray] | None:
+        """Names of signals, and a table of times (s) and these signals at the nodes of the last period's panels.
+
+        None where the run is not known between its outputs, or the table is larger than `MOST_BETWEEN`.
+        """
+        names = [name for key in _BETWEEN for name in self.record.names(key)]
+        if not isinstance(self._last, Stretch) or self._last.panels.shape[1] * NODES * len(names) > MOST_BETWEEN:
+            return None
+        t, *columns = self._last.at_nodes(names, _MISSED)
+        # Steps that stand for equal periods have the times of the one that was integrated.
+        assert self.period is not None
+        t = t + self.period * np.maximum(np.ceil((self._last.span[0] - t[:, :1]) / self.period - 1e-9), 0.0)
+        table = np.column_stack([x.ravel() for x in (t, *columns)])
+        return (names, table) if table.size <= MOST_BETWEEN else None
+
+    @cached_property
+    def _shown(self) -> tuple[str, ...]:
+        """Names of the signals in the summary: of gaps, or else of all layers, or else of all nodes."""
+        of_gaps = ("u_gap", "area", "f_el", "f_t", "friction")
+        keys = of_gaps if self.gaps else ("u_layer" if self.layers else "v", "area")
+        return tuple(name for key in ("u_source", *keys) for name in self.record.names(key))
 
     def summary(self) -> dict[str, Any]:
         """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.
@@ -199,7 +342,24 @@ class Solution(Sealed, Shown, Signalled, Figured):
         `f_el_mean_periodic` the mean over the last period of the source; figures of a period are None where the run is
         shorter. A circuit without GAP has figures of its layer voltages (``u_layer:Xcoat_max``) instead.
         """
-        return self._figures.summary()
+        if self.stored is not None:
+            return dict(self.stored)
+        out: dict[str, Any] = {"t_stop": float(self.t[-1]) if self.t.size else None, "status": self.status.name}
+        out |= {f"error_{k}": v for k, v in vars(self.error).items()}
+        if self._whole is None:
+            return out
+        out["figures_from"] = "steps" if isinstance(self._whole, Stretch) else "outputs"
+        for name in self._shown:
+            kinds = ["max", "min", "peak", "mean", "rms", "mean_periodic"]
+            kinds += ["ripple" if signal_of(name).ripple else "rms_periodic"] if self._last is not None else []
+            out |= {f"{name}_{kind}": self._one(name, kind) for kind in kinds}
+        if self._last is not None and self.fundamental is not None:
+            for name in (name for name in ("u_source", "u_gap") if name in self._shown):
+                out |= {f"{name}_{kind}": self._one(name, kind) for kind in ("amplitude", "phase_deg")}
+            out["fundamental"] = self.fundamental.frequency
+        if self.gaps:
+            out["fold_margin_min"] = min(self.fold_margin_min, float(self.fold_margin.min(initial=1.0)))
+        return out
 
     def provenance(self) -> dict[str, str]:
         """The data needed to repeat the run, as text."""
@@ -382,3 +542,21 @@ class Solution(Sealed, Shown, Signalled, Figured):
         from fingerspice.sets import cite
 
         return cite(self.circuit, self.method)
+
+
+def _row(name: str, s: dict[str, Any]) -> tuple[str, ...]:
+    """Name and figures of a signal, as the table has them."""
+    key, _, element = name.partition(":")
+    signal = signal_of(name)
+    label = {"u_layer": f"{element} voltage", "v": f"node {element}", "friction": f"friction coefficient {element}"}
+    cells = [label.get(key, f"{signal.text} {element}").rstrip()]
+    for kind in _COLUMNS.values():
+        if (value := s.get(f"{name}_{kind}")) is None:
+            cells.append("-")
+            continue
+        # A mean that is 0 to round-off is written as 0.
+        value = 0.0 if abs(value) <= 1e-12 * s[f"{name}_peak"] else value
+        # An area takes no prefix, which would be squared with its unit, and a coefficient has none.
+        plain = {"m^2": f"{1e6 * value:.4g} mm^2", "1": f"{value:.4g}"}
+        cells.append(plain.get(signal.unit) or format_si(value, signal.unit))
+    return tuple(cells)

@@ -126,14 +126,14 @@ def spectrum_of(
 
 def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | None:
     """Lines of the source's last period; None where the run holds none."""
-    period, figures = solution.period, solution._figures
-    if period is None or figures.last is None:
+    period = solution.period
+    if period is None or solution._last is None:
         return None
     count = _LINES if highest is None else int(highest * period * (1.0 + 1e-12))
     allowed = f"{1.0 / period:g} Hz, the lowest line, to {_MOST_LINES / period:g} Hz"
     require(1 <= count <= _MOST_LINES, "highest", f"{highest} Hz", allowed)
     # Charges and currents are those of the outputs alone.
-    if (last := figures.last_outputs if name.startswith(("q_", "i_")) else figures.last) is None:
+    if (last := solution._last_outputs if name.startswith(("q_", "i_")) else solution._last) is None:
         return None
     weighed = last.weigh(name, period / count)
     if isinstance(last, Outputs):

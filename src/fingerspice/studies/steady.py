@@ -23,9 +23,8 @@ from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.network import build_network, linear_scene, network_of, phasor_areas, with_skin_held
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.plots import drawing, traces
-from fingerspice.results import summary
 from fingerspice.results.outcome import ErrorEstimate, SolveError
-from fingerspice.results.solution import Sensitivity, Solution
+from fingerspice.results.solution import Figured, Sensitivity, Solution, Value
 from fingerspice.results.spectrum import PhasorSolution
 from fingerspice.results.steps import weigh_outputs
 from fingerspice.solve.derivatives import check_request, sensitivities_of
@@ -180,7 +179,7 @@ def phasor(
 
 
 @dataclass(frozen=True, repr=False)
-class SteadyState(Shown, summary.Figured):
+class SteadyState(Shown, Figured):
     """The periodic state with its defect, stability and error; its figures (`f_el_mean`, ...) are those of the period.
 
     Attributes
@@ -251,9 +250,8 @@ class SteadyState(Shown, summary.Figured):
         """1 minus the largest multiplier: 0 if a disturbance never decays."""
         return 1.0 - float(self.multipliers.max(initial=0.0))
 
-    @property
-    def _figures(self) -> summary.Figures:
-        return self.solution._figures
+    def _figure(self, key: str, kind: str) -> Value:
+        return self.solution._figure(key, kind)
 
     @property
     def sensitivities(self) -> Mapping[str, Sensitivity]:
@@ -584,7 +582,7 @@ def compare(
     ways: list[Any] = [np.array(figures).T]
     for one in (mean, coupled):
         lead = np.asarray(one.u_gap_phase_deg, float) - np.degrees(fundamental.phase)
-        area = one._figures.value("area", "mean_periodic")
+        area = one._figure("area", "mean_periodic")
         every = one.u_gap_amplitude, (lead + 180.0) % 360.0 - 180.0, one.f_el_mean_periodic, area
         ways.append(np.array(every, float).reshape(len(every), -1))
     first, second, third = (Figures(*(way[:, 0].tolist() if len(found) == 1 else way)) for way in ways)

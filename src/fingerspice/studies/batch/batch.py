@@ -402,7 +402,7 @@ def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> t
     if not paths:
         # What there is not is None, and so NaN.
         asked = [name for name in task.outputs if name != "u_gap"]
-        values = {name: np.asarray(run._figures.value(*_OUTPUTS[name]), float) for name in asked}
+        values = {name: np.asarray(run._figure(*_OUTPUTS[name]), float) for name in asked}
         if task.traced:
             values["u_gap"] = np.atleast_1d(np.asarray(run.u_gap, float))[: -1 if task.periodic else None]
         return values, error
