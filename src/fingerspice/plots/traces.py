@@ -397,63 +397,53 @@ def stems(
 
 def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     """Gain, phase, mean force and area against frequency, with a line per amplitude; without a GAP the nodes."""
-    figure, axes = drawing.new_figure(2, 1 if results[0].nodes else 2, height=4.6, sharex=True)
-    if results[0].nodes:
-        v = np.asarray(results[0].v_nodes)
-        _against_frequency(axes[0], results[0], np.abs(v), "Node voltage [V]", label=results[0].nodes)
-        _against_frequency(axes[1], results[0], np.degrees(np.angle(v)), "Phase [°]")
-        if np.all(np.abs(v).max(axis=0) > 0.0):
+    one, nodes = results[0], results[0].nodes
+    low, high = float(one.frequency.min()), float(one.frequency.max())
+    figure, axes = drawing.new_figure(2, 1 if nodes else 2, height=4.6, sharex=True)
+    forces = np.concatenate([r.f_el_mean for r in results])
+    factor, unit = drawing.engineering(drawing.peak_of(forces[np.isfinite(forces)]), "N", 0.05)
+    for number, r in enumerate(results):
+        order, v = np.argsort(r.frequency), np.asarray(r.v_nodes)
+        style: dict[str, Any] = {"label": nodes} if nodes else {
+            "label": f"{r.amplitude:.4g} V", "linestyle": ("-", "--", ":", "-.")[number % 4], "markersize": 3.5,
+        }  # fmt: skip
+        panels: list[tuple[FloatArray, str, str | None]] = [
+            (np.abs(r.gain), "|gap voltage / source|", drawing.BLUE),
+            (np.degrees(np.angle(r.gain)), "Lead of the gap voltage [°]", drawing.PURPLE),
+            (factor * r.f_el_mean, f"Mean electroadhesive force [{unit}]", drawing.VERMILION),
+            (1e6 * r.area, "Ridge area [mm²]", drawing.GREEN),
+        ]
+        if nodes:
+            panels = [(np.abs(v), "Node voltage [V]", None), (np.degrees(np.angle(v)), "Phase [°]", None)]
+        for ax, (values, label, color) in zip(axes, panels, strict=True):
+            marker = "o" if order.size < 12 else ""
+            ax.plot(r.frequency[order], values[order], color=color, linewidth=1.5, marker=marker, **style)
+            drawing.dress(ax, label)
+            ax.set_xscale("log")
+    how = f"source amplitude {f'{one.amplitude:.4g} V' if np.isfinite(one.amplitude) else 'no fundamental'}"
+    how = one.drive if nodes else how if len(results) == 1 else "several source amplitudes"
+    if nodes:
+        if np.all(np.abs(np.asarray(one.v_nodes)).max(axis=0) > 0.0):
             axes[0].set_yscale("log")
         axes[0].legend(fontsize=drawing.FONT, frameon=False)
-        how = results[0].drive
     else:
-        how = _plot_gains(axes, results)
-    f = results[0].frequency
-    low, high = f.min(), f.max()
+        for ax in axes:
+            ax.set_xlim(*((low, high) if low < high else (0.1 * low, 10.0 * low)))
+            ax.ticklabel_format(axis="y", useOffset=False)
+        drawing.from_zero(axes[0])
+        drawing.from_zero(axes[2])
+        drawing.flat(axes[3], 1e6 * np.concatenate([r.area for r in results]))
+    if not nodes and not np.isfinite(one.amplitude):
+        told = "the source has no fundamental"
+        axes[2].text(0.5, 0.5, told, transform=axes[2].transAxes, ha="center", fontsize=drawing.FONT)
+    if len(results) > 1:
+        axes[0].legend(fontsize=drawing.FONT, frameon=False, loc="lower right", handlelength=3.0)
     outside = ((low, min(high, SKIN_BAND[0])), (max(low, SKIN_BAND[1]), high)) if circuit.by_device("SKIN") else ()
     spans = [(a, b) for a, b in outside if b > a]
-    for ax in axes:
-        for a, b in spans:
-            ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
+    for (a, b), ax in itertools.product(spans, axes):
+        ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
     for ax in axes[-len(axes) // 2 :]:
         ax.set_xlabel("Frequency [Hz]", fontsize=drawing.FONT)
     shaded = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
     drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, shaded) if p))
     return figure
-
-
-def _plot_gains(axes: Sequence[Axes], results: Sequence[PhasorSolution]) -> str:
-    """The four panels of a circuit with a GAP; gives the drive in words."""
-    forces = np.concatenate([r.f_el_mean for r in results])
-    factor, unit = drawing.engineering(drawing.peak_of(forces[np.isfinite(forces)]), "N", 0.05)
-    for number, result in enumerate(results):
-        f = np.sort(result.frequency)
-        dashes, name = ("-", "--", ":", "-.")[number % 4], f"{result.amplitude:.4g} V"
-        for ax, values, label, color in (
-            (axes[0], np.abs(result.gain), "|gap voltage / source|", drawing.BLUE),
-            (axes[1], np.degrees(np.angle(result.gain)), "Lead of the gap voltage [°]", drawing.PURPLE),
-            (axes[2], factor * result.f_el_mean, f"Mean electroadhesive force [{unit}]", drawing.VERMILION),
-            (axes[3], 1e6 * result.area, "Ridge area [mm²]", drawing.GREEN),
-        ):
-            _against_frequency(ax, result, values, label, color=color, linestyle=dashes, label=name, markersize=3.5)
-            ax.set_xlim(*((f[0], f[-1]) if f[0] < f[-1] else (0.1 * f[0], 10.0 * f[0])))
-            ax.ticklabel_format(axis="y", useOffset=False)
-    drawing.from_zero(axes[0])
-    drawing.from_zero(axes[2])
-    amplitude = results[0].amplitude
-    if not np.isfinite(amplitude):
-        told = "the source has no fundamental"
-        axes[2].text(0.5, 0.5, told, transform=axes[2].transAxes, ha="center", fontsize=drawing.FONT)
-    if len(results) > 1:
-        axes[0].legend(fontsize=drawing.FONT, frameon=False, loc="lower right", handlelength=3.0)
-    drawing.flat(axes[3], 1e6 * np.concatenate([r.area for r in results]))
-    if len(results) > 1:
-        return "several source amplitudes"
-    return f"source amplitude {f'{amplitude:.4g} V' if np.isfinite(amplitude) else 'no fundamental'}"
-
-
-def _against_frequency(ax: Axes, result: PhasorSolution, values: FloatArray, y_label: str, **style: Any) -> None:
-    order = np.argsort(result.frequency)
-    ax.plot(result.frequency[order], values[order], linewidth=1.5, marker="o" if order.size < 12 else "", **style)
-    drawing.dress(ax, y_label)
-    ax.set_xscale("log")
