@@ -14,7 +14,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -198,8 +198,7 @@ _WAVEFORMS = {
         periodic.Repeat, samples.Samples,
     )
 }  # fmt: skip
-# Attributes of a circuit that a file holds as they are.
-_OF_CIRCUIT = ("title", "charge_law", "work", "warnings", "unused", "overrides", "initial")
+_LEFT_OUT = ("where", "text", "path")  # Attributes of a circuit and its elements that a file does not hold here
 
 
 def _failure(plain: dict[str, Any]) -> Failure:
@@ -367,85 +366,69 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
     arrays: list[FloatArray] = []
 
     def plain(value: Any) -> Any:
-        """A waveform, a row of numbers or a tuple of waveforms as plain data; anything else as it is."""
         if isinstance(value, Waveform):
             kind: Any = samples.Samples if isinstance(value, samples.Samples) else type(value)
             if kind in _WAVEFORMS.values():
-                own = {"kind": kind.__name__} | {f.name: getattr(value, f.name) for f in fields(kind)}
-            else:
-                end = stop if value.period is None else value.settled + value.period
-                step = circuit.tran.step if circuit.tran else 1e-3 * stop
-                # The run has warned of edges.
-                with warnings.catch_warnings(action="ignore"):
-                    table = source_table(value, 0.0, end, min(1e-3, max(0.05 * rtol, 1e-14)), step)
-                breaks = value.breakpoints(0.0, end)
-                name = getattr(getattr(value, "function", None), "__name__", "")
-                own = {"kind": "Function", "name": name, "repeat": value.period}
-                own |= {"breaks": breaks[breaks < end].tolist(), "edges": table.edges, "series": table.series}
-            return {name: plain(x) for name, x in own.items()}
-        if isinstance(value, tuple) and any(isinstance(x, Waveform) for x in value):
-            return [plain(part) for part in value]
-        if not isinstance(value, (tuple, np.ndarray)):
-            return value
-        arrays.append(np.asarray(value, float))
-        return {"array": len(arrays) - 1}
+                return plain({"kind": kind.__name__} | {f.name: getattr(value, f.name) for f in fields(kind)})
+            end = stop if value.period is None else value.settled + value.period
+            step = circuit.tran.step if circuit.tran else 1e-3 * stop
+            # The run has warned of edges.
+            with warnings.catch_warnings(action="ignore"):
+                table = source_table(value, 0.0, end, min(1e-3, max(0.05 * rtol, 1e-14)), step)
+            breaks = value.breakpoints(0.0, end)
+            name = getattr(getattr(value, "function", None), "__name__", "")
+            own = {"kind": "Function", "name": name, "repeat": value.period, "breaks": breaks[breaks < end].tolist()}
+            return plain(own | {"edges": table.edges, "series": table.series})
+        if is_dataclass(value):
+            names = [f.name for f in fields(value) if f.init and f.name not in _LEFT_OUT]
+            return {name: plain(getattr(value, name)) for name in names}
+        if isinstance(value, Mapping):
+            return {name: plain(x) for name, x in value.items()}
+        if isinstance(value, np.ndarray) or (isinstance(value, tuple) and value and isinstance(value[0], float)):
+            arrays.append(np.asarray(value, float))
+            return {"array": len(arrays) - 1}
+        return [*map(plain, value)] if isinstance(value, (tuple, list)) else value
 
-    elements = [
-        {f.name: getattr(e, f.name) for f in fields(Element) if f.name != "where"}
-        | {"waveform": plain(e.waveform), "values": dict(e.values), "ac": e.ac and vars(e.ac)}
-        for e in circuit.elements
-    ]
-    kept = {name: getattr(circuit, name) for name in _OF_CIRCUIT}
-    kept |= {"tran": circuit.tran and vars(circuit.tran), "ac": circuit.ac and vars(circuit.ac), "elements": elements}
-    kept["sets"] = {name: {path: plain(x) for path, x in one.items()} for name, one in circuit.sets.items()}
+    kept = plain(circuit)
     count = sum(array.size for array in arrays)
     if count > MOST_NUMBERS:
         return f"its sources have {count:,} numbers, and a file keeps at most {MOST_NUMBERS:,}", []
     return kept, arrays
 
 
-def made_again(kept: Mapping[str, Any], arrays: list[FloatArray]) -> Circuit:
+def made_again(kept: Any, arrays: list[FloatArray]) -> Circuit:
     """The circuit of `stored_circuit`; data that are not of a circuit raise an error of any of Python's kinds."""
-    elements = tuple(
-        Element(**{
-            **one, "nodes": tuple(map(str, one["nodes"])), "node_names": tuple(map(str, one["node_names"])),
-            "values": MappingProxyType({name: float(x) for name, x in one["values"].items()}),
-            **{name: _value(one[name], arrays) for name in ("waveform", "initial")},
-            "ac": one["ac"] and SmallSignal(**one["ac"]),
-        })
-        for one in kept["elements"]
-    )  # fmt: skip
-    plain = {name: kept[name] for name in _OF_CIRCUIT}
-    plain |= {name: tuple(map(str, kept[name])) for name in ("warnings", "unused")}
-    sets = {name: {path: _value(x, arrays) for path, x in one.items()} for name, one in kept["sets"].items()}
-    tran, ac = kept["tran"] and Tran(**kept["tran"]), kept["ac"] and AcSweep(**kept["ac"])
-    return checked(Circuit(**{**plain, "elements": elements, "tran": tran, "ac": ac, "sets": sets}))
 
+    def made(plain: Any) -> Any:
+        if isinstance(plain, list):
+            return tuple(map(made, plain))
+        if not isinstance(plain, dict):
+            return plain
+        if isinstance(plain.get("array"), int):
+            return arrays[plain["array"]]
+        given = {name: made(x) for name, x in plain.items()}
+        # What a node of that name begins with is a number.
+        if not isinstance(given.get("kind"), str):
+            return given
+        if (kind := given.pop("kind")) != "Function":
+            waveform: Any = _WAVEFORMS[kind]
+            return waveform(**given)
+        series, name = given["series"], given["name"]
+        table = SourceTable(given["edges"], np.zeros((len(series), 1, 6)), series)
+        along = partial(_along, table, given["repeat"])
+        # By its name the run's summary shows a function.
+        vars(along).update({"__name__": str(name)} if name else {})
+        return Function(along, given["breaks"], given["repeat"])
 
-def _value(plain: Any, arrays: list[FloatArray]) -> Any:
-    """What `plain` of `stored_circuit` was given."""
-    if isinstance(plain, list):
-        return tuple(_value(part, arrays) for part in plain)
-    if plain is None or isinstance(plain, (int, float)):
-        return plain
-    if not isinstance(plain, dict):
-        raise ValueError(f"{plain!r} is no waveform")
-    if "array" in plain:
-        return arrays[plain["array"]]
-    given = {name: _value(x, arrays) for name, x in plain.items() if name not in ("kind", "name")}
-    if plain["kind"] != "Function":
-        for name, x in given.items():
-            parts = x if isinstance(x, tuple) else (x,)
-            if any(isinstance(part, Waveform) != (name in ("parts", "waveform")) for part in parts):
-                raise ValueError(f"{name} of {plain['kind']} is {x!r}")
-        made: Any = _WAVEFORMS[plain["kind"]]
-        return made(**given)
-    series = given["series"]
-    table = SourceTable(given["edges"], np.zeros((len(series), 1, 6)), series)
-    along = partial(_along, table, given["repeat"])
-    # By its name the run's summary shows a function.
-    vars(along).update({"__name__": str(plain["name"])} if plain["name"] else {})
-    return Function(along, given["breaks"], given["repeat"])
+    own = made(kept)
+    for one in own["elements"]:
+        one["values"] = MappingProxyType({name: float(x) for name, x in one["values"].items()})
+        one["ac"] = one["ac"] and SmallSignal(**one["ac"])
+        if not isinstance(one["waveform"], (Waveform, type(None))):
+            raise ValueError(f"{one['waveform']!r} is no waveform")
+    own["elements"] = tuple(Element(**one) for one in own["elements"])
+    tran, ac = own["tran"] and Tran(**own["tran"]), own["ac"] and AcSweep(**own["ac"])
+    return checked(Circuit(**{**own, "tran": tran, "ac": ac}))
 
 
 def _along(table: SourceTable, repeat: float | None, t: FloatArray) -> FloatArray:
