@@ -301,14 +301,9 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
     def _last_outputs(self) -> Outputs | None:
         """The outputs of the source's last period; None where they are too few."""
         assert self.period is not None
-        tolerance = 1e-9 * self.period
-        t, start = self.t, float(self.t[-1] - self.period)
-        if start < t[0] - tolerance or np.count_nonzero(t >= start) < 8:
-            return None
-        first, after = (int(i) for i in np.searchsorted(t, [start - tolerance, start + tolerance], side="right"))
-        # Of two outputs at a jump, the period starts with the right-hand one.
-        exact = abs(t[first] - start) <= tolerance
-        return Outputs(self.record, after - 1) if exact else Outputs(self.record, first, start)
+        start, tolerance = float(self.t[-1] - self.period), 1e-9 * self.period
+        too_few = start < self.t[0] - tolerance or np.count_nonzero(self.t >= start) < 8
+        return None if too_few else Outputs(self.record, start, tolerance)
 
     def _between(self) -> tuple[list[str], FloatArray] | None:
         """Names of signals, and a table of times (s) and these signals at the nodes of the last period's panels.

@@ -348,17 +348,19 @@ class Stretch:
 
 
 class Outputs(NamedTuple):
-    """Outputs of a record from number `first` on; after interpolated ones at a time `start` (s) if that is given."""
+    """Outputs of a record since a time (s); those at that time itself are interpolated where there are none."""
 
     record: Signals
-    first: int = 0
-    start: float | None = None
+    since: float = -math.inf
+    tolerance: float = 0.0  # Distance (s) up to which an output is one at that time
 
     def _values(self, name: str) -> tuple[FloatArray, FloatArray]:
-        t, x = self.record.t, self.record.one(name)
-        if self.start is None:
-            return t[self.first :], x[self.first :]
-        return np.append(self.start, t[self.first :]), np.append(np.interp(self.start, t, x), x[self.first :])
+        t, x, ends = self.record.t, self.record.one(name), (self.since - self.tolerance, self.since + self.tolerance)
+        first, after = np.searchsorted(t, ends, side="right").tolist()
+        if first == after > 0:
+            return np.append(self.since, t[first:]), np.append(np.interp(self.since, t, x), x[first:])
+        # Of two outputs at a jump, the right-hand one is the first.
+        return t[max(after - 1, 0) :], x[max(after - 1, 0) :]
 
     def weigh(self, name: str, longest: float = math.inf) -> Weighed:
         """A signal with weights for its means, whatever `longest` is: nothing is known between the outputs."""
