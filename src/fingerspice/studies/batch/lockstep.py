@@ -438,24 +438,23 @@ class Ladder:
     def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
         """Estimated error of the scenes `pending`: the largest of all outputs, relative to themselves."""
         peak, closing, tail = run.fine[-3:]
-        changes = [np.zeros(peak.size)]
-        for row in self.needed:
-            size, change = np.abs(run.fine[row]), np.abs(run.fine[row] - run.coarse[row])
-            later = row + self.n_moment
-            if self.form.recording is not None:
-                # Each zero of the gap voltage adds an error as if by chance, so that the sum of all may be small by
-                # chance with half the steps, and not with all of them. The root of the sum of their squares is not.
-                portions = slice(later, -3, self.n_moment)
-                change = np.maximum(change, np.linalg.norm(run.fine[portions] - run.coarse[portions], axis=0))
-            elif level.halves > 1:
-                last = np.abs(run.fine[later])
-                changes.append(np.abs(run.fine[later] - run.coarse[later]) / np.where(last > 0.0, last, 1.0))
-            changes.append(change / np.where(size > 0.0, size, 1.0))
+        # Of the moments that are needed, in the whole run and in its parts, of shape (n_part + 1, n_needed, n)
+        size, change = (
+            np.abs(x[:-3]).reshape(-1, self.n_moment, peak.size)[:, self.needed]
+            for x in (run.fine, run.fine - run.coarse)
+        )
+        if self.form.recording is not None:
+            # Each zero of the gap voltage adds an error as if by chance, so that the sum of all may be small by chance
+            # with half the steps, and not with all of them. The root of the sum of their squares is not.
+            change[0] = np.maximum(change[0], np.linalg.norm(change[1:], axis=0))
+        if self.form.recording is not None or level.halves == 1:
+            size, change = size[:1], change[:1]
+        off = (change / np.where(size > 0.0, size, 1.0)).max(axis=(0, 1))
         if self.task.traced:
-            off = np.abs(run.trace[:, : 2 * run.trace_coarse.shape[1] : 2] - run.trace_coarse).max(axis=1)
-            changes.append(off / np.where(peak > 0.0, peak, 1.0))
+            missed = np.abs(run.trace[:, : 2 * run.trace_coarse.shape[1] : 2] - run.trace_coarse).max(axis=1)
+            off = np.maximum(off, missed / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
-        change, decays = np.max(changes, axis=0) + run.coarse[-1], self.decays[pending]
+        change, decays = off + run.coarse[-1], self.decays[pending]
         # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
         begins = 2.0 * decays > _STIFF * level.steps
         more = np.where(self.task.traced | begins | (self.least[pending] > decays), _STATED_MORE, _STATED)

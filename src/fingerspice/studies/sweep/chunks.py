@@ -102,8 +102,7 @@ class Work:
         self.chunks = math.prod(self._grid)
         require(self.chunks <= MOST_CHUNKS, "the sweep", f"{math.prod(plan.sizes):,} scenes", "at most "
                 f"{MOST_CHUNKS:,} chunks of {math.prod(self.block):,}")  # fmt: skip
-        if plan.drawn:
-            plan.divide(self.block[-1])
+        plan.count = self.block[-1] if plan.drawn else plan.n
         # With ``error`` and, as the last, ``status``
         self.outputs = {
             str(name): Array(
