@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice import sets
-from fingerspice.base.arrays import FloatArray, real_number, real_numbers, whole_number
+from fingerspice.base.arrays import FloatArray, Remembering, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
@@ -38,7 +38,7 @@ RESAMPLES = 499
 _NUMBERS = "a number, an array of numbers, or a frozen distribution of scipy.stats such as norm(3.5e-6, 0.3e-6)"
 
 
-class Plan:
+class Plan(Remembering):
     """Parameters of a circuit that make a grid, those that are drawn, and those that are one number, by name.
 
     Names are paths, several paths with commas, whose numbers are factors, or kinds of sets, whose numbers count them.
@@ -118,16 +118,17 @@ class Plan:
         points = np.clip(points, _EDGE, 1.0 - _EDGE)
         return {path: np.asarray(law.ppf(points[:, i]), float) for i, (path, law) in enumerate(self.drawn.items())}
 
-    # A process makes the bits of the first part once, and once those that each bit of a part's number asks for.
-    @lru_cache(BITS + 1)  # noqa: B019
     def _bits(self, start: int, count: int) -> NDArray[np.int64]:
-        """Bits of so many points of the unit cube from one on, shape (count, n_drawn)."""
+        """Bits of so many points of the unit cube from one on, shape (count, n_drawn), which a process makes once."""
         from scipy.stats import qmc
 
-        engine = qmc.Sobol(len(self.drawn), scramble=True, bits=BITS, rng=self.seed)
-        if start:
-            engine.fast_forward(start)
-        return np.asarray(engine.random(count) * 2.0**BITS, np.int64)
+        def bits() -> NDArray[np.int64]:
+            engine = qmc.Sobol(len(self.drawn), scramble=True, bits=BITS, rng=self.seed)
+            if start:
+                engine.fast_forward(start)
+            return np.asarray(engine.random(count) * 2.0**BITS, np.int64)
+
+        return self.remember(("bits", start, count), bits, BITS + 1)
 
     # Two chunks may run at once, and those after them mostly have the same draws.
     @lru_cache(2)  # noqa: B019
