@@ -111,7 +111,7 @@ def killing(pids: Callable[[], list[int]], store: Path, most: int) -> Iterator[l
 def test_draws_in_parts_are_those_of_the_whole(circuit):
     for count in (1 << 9, 1 << 14):
         plan = Plan(circuit, PARAMETERS, 1 << 14, 5, 1 << 30)
-        plan.divide(count)
+        plan.count = count
         draws = plan.quantiles(stats.qmc.Sobol(2, scramble=True, bits=30, rng=5).random(plan.n))
         parts = [plan.draws(i) for i in range(plan.n // count)]
         for name, values in draws.items():

@@ -259,7 +259,7 @@ def explore(
     port: Annotated[int, "Port of the loopback address; 0 takes a free one."] = 0,
     no_browser: Annotated[bool, "Print the link, and open no browser."] = False,
     static: Annotated[Path | None, "Write the page as one file, and serve nothing.", "OUT.html"] = None,
-) -> Callable[[], None] | None:
+) -> None:
     """Open a local page on which DECK's values move and the run follows; Ctrl-C ends it.
 
     Examples:
@@ -278,7 +278,7 @@ def explore(
 
         check_output(static, deck)
         _give_file(job, static, static_page(circuit))
-        return None
+        return
     explorer, ended = fs.Explorer(circuit, port), list[int]()
     job.answer.update(url=explorer.url)
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -293,7 +293,7 @@ def explore(
             time.sleep(0.1)
         explorer.stop()
 
-    return serve
+    job.then = serve
 
 
 def figures(
@@ -361,7 +361,7 @@ def check(
 _FILES = "deck out name overwrite"
 _END = "json no_plot"
 #: Every command with all its options, in the order of its help.
-_COMMANDS: dict[Callable[..., Callable[[], None] | None], str] = {
+_COMMANDS: dict[Callable[..., None], str] = {
     run: f"{_FILES} rtol charge_law area method set finger coating drive source stop start jumps csv "
     f"stream chunk signals netcdf feel schematic {_END}",
     ac: f"{_FILES} sweep area amplitude skin finger charge_law rtol set source {_END}",

@@ -11,8 +11,8 @@ import os
 import re
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -73,30 +73,30 @@ class Job:
     no_plot: Annotated[bool, "Write no picture."] = False
     files: dict[str, Path] = field(default_factory=dict, init=False)  # Files of the results by their endings
     about: dict[str, str] = field(default_factory=dict, init=False)  # Texts kept in a picture
+    then: Callable[[], None] | None = field(default=None, init=False)  # Called after the answer has been printed
 
-    def __enter__(self) -> Job:
-        self._warnings = warnings.catch_warnings(action="always", category=FingerspiceWarning)
-        self._warnings.__enter__()
-        warnings.showwarning = self._show
-        return self
+    @contextmanager
+    def told(self) -> Iterator[None]:
+        """What is done inside is told: by its warnings, and by the answer at its end."""
+        with warnings.catch_warnings(action="always", category=FingerspiceWarning):
+            warnings.showwarning = self._show
+            try:
+                yield
+                self.answer.update(success=True, status="SUCCESS", message="success")
+            except Exception as error:
+                _, status, said = outcome(error)
+                failure = error.failure.to_dict() if isinstance(error, SolveError) else None
+                self.answer.update(status=status, message=said, failure=failure)
+                raise
+            finally:
+                if self.json:
+                    say_json(self.answer)
 
     def _show(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         text = str(message)
         if text not in self.answer["warnings"]:
             self.answer["warnings"].append(text)
             complain(f"warning: {text}")
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: Any) -> None:
-        self._warnings.__exit__(kind, error, None)
-        if not self.json or not (error is None or isinstance(error, Exception)):
-            return
-        if error is None:
-            self.answer.update(success=True, status="SUCCESS", message="success")
-        else:
-            _, status, said = outcome(error)
-            failure = error.failure.to_dict() if isinstance(error, SolveError) else None
-            self.answer.update(status=status, message=said, failure=failure)
-        say_json(self.answer)
 
     def read(self) -> fs.Circuit:
         """The circuit that the options ask for, of which the answer tells.
@@ -216,21 +216,19 @@ class Job:
         raise InputError(f"{file} holds a result {said[0]}, and this one is {said[1]}; {ways}")
 
 
-def add_command(app: typer.Typer, options: str, function: Callable[..., Callable[[], None] | None]) -> None:
-    """Make a function of a `Job` and of options of its own a command, whose help has all options in this order.
-
-    What the function returns, if anything, is called after its answer has been printed.
-    """
+def add_command(app: typer.Typer, options: str, function: Callable[..., None]) -> None:
+    """Make a function of a `Job` and of options of its own a command, whose help has all options in this order."""
     name = function.__name__.replace("_", "-")
     own = inspect.signature(function, eval_str=True).parameters
     known = {**inspect.signature(Job, eval_str=True).parameters, **own}
 
     def call(**given: Any) -> None:
         shared = {key: value for key, value in given.items() if key not in own}
-        with Job(blank(name, given), **{"deck": Path(), **shared}) as job:
-            then = function(job, **{key: value for key, value in given.items() if key in own})
-        if then is not None:
-            then()
+        job = Job(blank(name, given), **{"deck": Path(), **shared})
+        with job.told():
+            function(job, **{key: value for key, value in given.items() if key in own})
+        if job.then is not None:
+            job.then()
 
     taken = []
     for one in (known[key] for key in options.split()):

@@ -29,6 +29,7 @@ from fingerspice.cli.options import Job, check_output, number
 from fingerspice.results import runfile
 from fingerspice.results.record import SIGNALS, variables
 from fingerspice.solve.streaming import Stream, stream
+from fingerspice.waveforms.waveform import refuse
 
 #: Attributes of the group: identity of the run, number of finished chunks, state to continue from, results so far, and
 #: the number of columns of each array, 0 for one without.
@@ -72,26 +73,23 @@ class Store:
         if not os.path.lexists(self.path):
             return
         self._hold(self.path)
-        try:
+        whole = False
+        with suppress(OSError, ValueError, KeyError, TypeError):
             held = runfile.attributes_of(self.path)
             kinds = {RUN: dict, MARK: dict, SO_FAR: dict, COLUMNS: dict, DONE: int}
-            whole = all(isinstance(held[key], kind) for key, kind in kinds.items()) and held[DONE] >= 0
-            whole = whole and held.get(runfile.SIGNATURE, "") in ("", runfile.signature(held))
-        except (OSError, ValueError, KeyError, TypeError):
-            whole = False
-        if not whole:
-            raise InputError(f"{self.path} is there already and is no whole store of a run; allowed: --name or --out")
+            signed = held.get(runfile.SIGNATURE, "") in ("", runfile.signature(held))
+            whole = signed and all(isinstance(held[key], kind) for key, kind in kinds.items()) and held[DONE] >= 0
+        refuse(not whole, f"{self.path} is there already and is no whole store of a run; allowed: --name or --out")
         if overwrite:
             shutil.rmtree(self.path)
             return
         self.there = True
         for key, own in self.run.items():
             other = held[RUN].get(key)
-            if other != own:
-                said = "" if len(f"{other}{own}") > 80 else f" ({other}, and this one {own})"
-                what = f"{'other' if key == 'signals' else 'another'} {key.replace('_', ' ')}{said}"
-                ways = "allowed: --name NAME, another --out, or --overwrite"
-                raise InputError(f"{self.path} holds a run of {what}; {ways}")
+            said = "" if len(f"{other}{own}") > 80 else f" ({other}, and this one {own})"
+            what = f"{'other' if key == 'signals' else 'another'} {key.replace('_', ' ')}{said}"
+            ways = "allowed: --name NAME, another --out, or --overwrite"
+            refuse(other != own, f"{self.path} holds a run of {what}; {ways}")
         self.done, self.mark, self.so_far = held[DONE], held[MARK], held[SO_FAR]
         # What a call that was killed has left.
         runfile.tidy(self.path)

@@ -263,44 +263,41 @@ def _parameter(path: str, one: Any) -> Any:
     require(known, path, repr(one), allowed)
     kind, numbers = next(iter(one.items()))
     allowed = _KINDS[kind]
-    good = isinstance(numbers, list) and len(numbers) > 0 and all(isinstance(x, int | float) for x in numbers)
-    if good and kind == "values":
-        return np.array(numbers, float)
-    if good and len(numbers) == allowed.count(",") + 1 == 3:
-        allowed += ", a whole count, for log above 0"
-        first, last, count = map(float, numbers)
-        if count.is_integer() and 1 <= count <= 100_000 and (kind == "linear" or min(first, last) > 0.0):
-            return (np.linspace if kind == "linear" else np.geomspace)(first, last, int(count))
-    elif good and len(numbers) == allowed.count(",") + 1:
-        allowed += ", ascending or above 0"
-        a, b = map(float, numbers)
-        if (a < b if kind.endswith("uniform") else b > 0.0) and (a > 0.0 or not kind.startswith("log")):
-            if kind.startswith("log"):
-                return stats.loguniform(a, b) if kind == "loguniform" else stats.lognorm(b, scale=a)
-            return stats.uniform(a, b - a) if kind == "uniform" else stats.norm(a, b)
+    given = isinstance(numbers, list) and all(isinstance(x, int | float) for x in numbers)
+    match kind, list(map(float, numbers)) if given else []:
+        case "values", [_, *_] as values:
+            return np.array(values)
+        case (("linear" | "log"), [first, last, count]):
+            allowed += ", a whole count, for log above 0"
+            if count.is_integer() and 1 <= count <= 100_000 and (kind == "linear" or min(first, last) > 0.0):
+                return (np.linspace if kind == "linear" else np.geomspace)(first, last, int(count))
+        case (("uniform" | "loguniform" | "normal" | "lognormal"), [a, b]):
+            allowed += ", ascending or above 0"
+            if (a < b if kind.endswith("uniform") else b > 0.0) and (a > 0.0 or not kind.startswith("log")):
+                if kind.startswith("log"):
+                    return stats.loguniform(a, b) if kind == "loguniform" else stats.lognorm(b, scale=a)
+                return stats.uniform(a, b - a) if kind == "uniform" else stats.norm(a, b)
     raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {allowed}")
 
 
 def _shared(rows: list[dict[str, Any]], output: str) -> str:
     """Total indices as text: a line for each place, a column for each parameter, and what is largest where."""
-    widths = {name: max(len(name), 16) + 2 for name in sorted({row["parameter"] for row in rows}, key=str.lower)}
-    lines: dict[str, dict[str, str]] = {}
-    first: dict[str, list[str]] = {}
-    for row in rows:
+    names = sorted({row["parameter"] for row in rows}, key=str.lower)
+    lines, first = [["", *names]], dict[str, list[str]]()
+    # The rows of a place stand together, the largest index first.
+    for i in range(0, len(rows), len(names)):
         # A number, or the name of a set.
-        place = ", ".join(f"{name} = {x if isinstance(x, str) else f'{x:.4g}'}" for name, x in row["place"].items())
-        if place not in lines:
-            first.setdefault(row["parameter"], []).append(place)
-        lines.setdefault(place, {})[row["parameter"]] = "{total:.2f} ({low:.2f}-{high:.2f})".format(**row)
-    wide = max(len(place) for place in lines) + 2 * any(lines)
-
-    def line(place: str, cells: Mapping[str, str]) -> str:
-        return f"{place:<{wide}}" + "".join(f"{cells[name]:>{width}}" for name, width in widths.items())
-
-    head, body = line("", {name: name for name in widths}), [line(place, told) for place, told in lines.items()]
+        values = rows[i]["place"].items()
+        place = ", ".join(f"{name} = {x if isinstance(x, str) else f'{x:.4g}'}" for name, x in values)
+        first.setdefault(rows[i]["parameter"], []).append(place)
+        told = {row["parameter"]: "{total:.2f} ({low:.2f}-{high:.2f})".format(**row) for row in rows[i:][: len(names)]}
+        lines.append([place, *(told[name] for name in names)])
+    wide = max(len(place) for place, *_ in lines)
+    widths = [f"<{wide + 2 if wide else 0}", *(f">{max(len(name), 16) + 2}" for name in names)]
+    table = ["".join(map(format, line, widths)) for line in lines]
     most = "; ".join(
         name + ("" if len(first) == 1 else f" ({places[0]}{f' to {places[-1]}' if len(places) > 1 else ''})")
         for name, places in first.items()
     )
     title = f"share of the variance of {output} that comes from a parameter, its interactions included (95 % interval)"
-    return "\n".join([title, head, *body, f"largest share: {most}"])
+    return "\n".join([title, *table, f"largest share: {most}"])

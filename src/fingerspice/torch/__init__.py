@@ -22,7 +22,7 @@ from fingerspice.results.solution import DERIVED, MEANS, Solution
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import LEAST_RTOL, REFUSED, batch, own_path
 from fingerspice.studies.batch.lockstep import lockstep_form, why_alone
-from fingerspice.studies.steady import SteadyState, steady_state
+from fingerspice.studies.steady import steady_state
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import refuse, require
 
@@ -36,13 +36,14 @@ except ImportError:
 __all__ = ["Drive", "Simulator"]
 
 
-class Scenes:
-    """Runs of a circuit with other values of its parameters; what is asked of them, as of `Simulator`, is checked."""
+class Runs(torch.nn.Module):
+    """A module that runs a circuit; what is asked of it, as of `Simulator`, is checked."""
 
     def __init__(
         self, circuit: Circuit, outputs: str | Sequence[str], t: ArrayLike | None, t_stop: float | None,
         periodic: bool, rtol: float,
     ) -> None:  # fmt: skip
+        super().__init__()
         require_circuit(circuit)
         gaps = len(circuit.by_device("GAP"))
         refuse(gaps != 1, f"the circuit has {gaps} GAPs; allowed: one")
@@ -89,31 +90,27 @@ class Scenes:
         rows = []
         for i, row in enumerate(given):
             with named("scene", i):
-                runs = self._runs(self.circuit.varied(dict(zip(paths, row.tolist(), strict=True))), wanted)
-                if wanted:
-                    by = [np.hstack([getattr(run.sensitivities[x], name) for name, run in runs]) for x in wanted]
-                    rows.append(np.stack(by, axis=-1))
-                else:
-                    rows.append(np.hstack([getattr(run, name) for name, run in runs]))
+                circuit = self.circuit.varied(dict(zip(paths, row.tolist(), strict=True)))
+                runs: dict[str, Any] = {}
+                if self.t.size or not self.periodic:
+                    start = "periodic" if self.periodic else "deck"
+                    runs = dict.fromkeys(self.outputs, self.run(circuit, start=start, sensitivities=wanted))
+                if of_period := [name for name in self.outputs if self.periodic and name in MEANS]:
+                    state = steady_state(circuit, rtol=self.rtol, points=4, charge=False, sensitivities=wanted)
+                    runs |= dict.fromkeys(of_period, state)
+                by = [np.hstack([getattr(run.sensitivities[x], name) for name, run in runs.items()]) for x in wanted]
+                own = np.hstack([getattr(run, name) for name, run in runs.items()])
+                rows.append(np.stack(by, axis=-1) if wanted else own)
         return np.array(rows)
 
-    def given_back(self, found: Tensor) -> Tensor | dict[str, Tensor]:
-        """The outputs in a tensor (..., sum of `sizes`) by their names, or the one that was asked for alone."""
-        parts = dict(zip(self.outputs, found.split(self.sizes, dim=-1), strict=True))
-        parts = {name: part.squeeze(-1) if name in MEANS else part for name, part in parts.items()}
-        return parts[self.outputs[0]] if self.alone else parts
+    def by_name(self, found: Tensor) -> dict[str, Tensor]:
+        """The outputs in a tensor (..., sum of `sizes`) by their names."""
+        parts = zip(self.outputs, found.split(self.sizes, dim=-1), strict=True)
+        return {name: part.squeeze(-1) if name in MEANS else part for name, part in parts}
 
-    def _runs(self, circuit: Circuit, wanted: Sequence[str]) -> list[tuple[str, Solution | SteadyState]]:
-        """Every output, with a run of the circuit that has it."""
-        of_period = [name for name in self.outputs if self.periodic and name in MEANS]
-        found: dict[str, Solution | SteadyState] = {}
-        if len(of_period) < len(self.outputs):
-            run = self.run(circuit, start="periodic" if self.periodic else "deck", sensitivities=wanted)
-            found = dict.fromkeys(self.outputs, run)
-        if of_period:
-            state = steady_state(circuit, rtol=self.rtol, points=4, charge=False, sensitivities=wanted)
-            found |= dict.fromkeys(of_period, state)
-        return list(found.items())
+    def given_back(self, found: Tensor) -> Tensor | dict[str, Tensor]:
+        """What a call gives: the outputs by their names, or the one that was asked for alone."""
+        return self.by_name(found)[self.outputs[0]] if self.alone else self.by_name(found)
 
     def run(self, circuit: Circuit, **how: Any) -> Solution:
         """A run of a circuit, with outputs at the times `t`, or at its end where there are only means."""
@@ -139,7 +136,7 @@ def tensor_of(path: str, one: Tensor | ArrayLike) -> Tensor:
     return one.to("cpu", torch.float64)
 
 
-class Drive(torch.nn.Module):
+class Drive(Runs):
     """A circuit under a recording whose samples are the module's parameter `samples`, V.
 
     The gradient by all samples costs a few runs, however many samples there are (`Solution.sample_gradient`).
@@ -169,8 +166,7 @@ class Drive(torch.nn.Module):
         self, circuit: Circuit, samples: Tensor | ArrayLike, rate: float, outputs: str | Sequence[str] = "f_el_mean", *,
         t: ArrayLike | None = None, t_stop: float | None = None, source: str | None = None, rtol: float = 1e-8,
     ) -> None:  # fmt: skip
-        super().__init__()
-        self._scenes = Scenes(circuit, outputs, t, t_stop, False, rtol)
+        super().__init__(circuit, outputs, t, t_stop, False, rtol)
         known = {element.name.lower(): element.name for element in circuit.elements if element.waveform is not None}
         allowed = f"one of {', '.join(known.values())}"
         require(source is not None or len(known) == 1, "source", "missing", allowed)
@@ -199,18 +195,7 @@ class Drive(torch.nn.Module):
         """
         given = self.samples if samples is None else tensor_of("samples", samples)
         require(given.ndim > 0, "samples", "one number", "a row of two or more")
-        found: Tensor = _DriveRun.apply(self, given)
-        return self._scenes.given_back(found)
-
-
-def _backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
-    """Derivatives by the samples, from one way back through every run."""
-    rows = []
-    for run, row in zip(ctx.runs, by_output.reshape(len(ctx.runs), -1).numpy(), strict=True):
-        parts = zip(ctx.scenes.outputs, np.split(row, np.cumsum(ctx.scenes.sizes)[:-1]), strict=True)
-        weights = {name: part[0] if name in MEANS else part for name, part in parts}
-        rows.append(run.sample_gradient(**weights).values)
-    return None, torch.from_numpy(np.stack(rows)).reshape(ctx.shape)
+        return self.given_back(_DriveRun.apply(self, given))
 
 
 # The methods have the names and signatures that torch calls.
@@ -219,19 +204,24 @@ class _DriveRun(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, drive: Drive, samples: Tensor) -> Tensor:
-        scenes = drive._scenes
-        ctx.scenes, ctx.runs, ctx.shape = scenes, [], samples.shape
+        ctx.drive, ctx.runs, ctx.shape = drive, [], samples.shape
         for i, row in enumerate(samples.detach().numpy().reshape(-1, samples.shape[-1])):
             with named("drive", i):
-                ctx.runs.append(scenes.run(scenes.circuit, sources={drive._source: Samples(row, drive._rate)}))
-        rows = [np.hstack([getattr(run, name) for name in scenes.outputs]) for run in ctx.runs]
+                ctx.runs.append(drive.run(drive.circuit, sources={drive._source: Samples(row, drive._rate)}))
+        rows = [np.hstack([getattr(run, name) for name in drive.outputs]) for run in ctx.runs]
         return torch.from_numpy(np.stack(rows)).reshape(*samples.shape[:-1], -1)
 
-    # Not a decorator: without torch, types are not known.
-    backward: Any = staticmethod(torch.autograd.function.once_differentiable(_backward))
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
+        """Derivatives by the samples, from one way back through every run."""
+        rows = []
+        for run, row in zip(ctx.runs, by_output.reshape(len(ctx.runs), -1), strict=True):
+            rows.append(run.sample_gradient(**{k: x.numpy() for k, x in ctx.drive.by_name(row).items()}).values)
+        return None, torch.from_numpy(np.stack(rows)).reshape(ctx.shape)
 
 
-class Simulator(torch.nn.Module):
+class Simulator(Runs):
     """A circuit whose parameters are those of a module, and whose runs have exact derivatives by them.
 
     Every parameter is a `torch.nn.Parameter` in double precision, in the netlist's unit, whose name is the path with
@@ -269,9 +259,8 @@ class Simulator(torch.nn.Module):
         outputs: str | Sequence[str] = "f_el_mean", *, t: ArrayLike | None = None, t_stop: float | None = None,
         periodic: bool = False, logarithms: bool = False, rtol: float = 1e-8,
     ) -> None:  # fmt: skip
-        super().__init__()
-        self._scenes = Scenes(circuit, outputs, t, t_stop, periodic, rtol)
-        self.circuit, self.logarithms, self.paths = circuit, logarithms, dict[str, str]()
+        super().__init__(circuit, outputs, t, t_stop, periodic, rtol)
+        self.logarithms, self.paths = logarithms, dict[str, str]()
         single = isinstance(parameters, str)
         require(not single, "parameters", repr(parameters), "a sequence of paths such as ('Xgap.d',)")
         for given in parameters:
@@ -286,7 +275,7 @@ class Simulator(torch.nn.Module):
 
     def extra_repr(self) -> str:
         """The module's parameters and outputs, for its text."""
-        return f"{', '.join(self.paths)} -> {', '.join(self._scenes.outputs)}"
+        return f"{', '.join(self.paths)} -> {', '.join(self.outputs)}"
 
     def value(self, path: str) -> Tensor:
         """Value of one of the module's parameters in the netlist's unit.
@@ -329,23 +318,22 @@ class Simulator(torch.nn.Module):
         except RuntimeError:
             shapes = ", ".join(f"{tuple(one.shape)} ({path})" for path, one in every.items())
             raise InputError(f"the values have shapes {shapes}; allowed: shapes that broadcast") from None
-        found: Tensor = _Run.apply(self._scenes, tuple(every), (), *shaped)
-        return self._scenes.given_back(found)
+        return self.given_back(_Run.apply(self, tuple(every), (), *shaped))
 
 
 # The methods have the names and signatures that torch calls.
 class _Run(torch.autograd.Function):
-    """The outputs of scenes at values of one shape (...), or derivatives by `wanted`, as of `Scenes.values`."""
+    """The outputs of scenes at values of one shape (...), or derivatives by `wanted`, as of `Runs.values`."""
 
     @staticmethod
-    def forward(scenes: Scenes, paths: tuple[str, ...], wanted: tuple[str, ...], *values: Tensor) -> Tensor:
+    def forward(module: Runs, paths: tuple[str, ...], wanted: tuple[str, ...], *values: Tensor) -> Tensor:
         rows = torch.stack([one.flatten() for one in values], dim=1).numpy(force=True)
-        found = scenes.values(paths, rows, wanted)
+        found = module.values(paths, rows, wanted)
         return torch.from_numpy(found).reshape(*values[0].shape, *found.shape[1:])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.scenes, ctx.paths, ctx.wanted, *values = inputs
+        ctx.module, ctx.paths, ctx.wanted, *values = inputs
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*values)
         ctx.save_for_forward(*values)
@@ -368,16 +356,16 @@ class _Run(torch.autograd.Function):
         return (slopes * torch.stack([one for _, one in moved], dim=-1).unsqueeze(-2)).sum(-1)
 
     @staticmethod
-    def vmap(info: Any, dims: tuple[Any, ...], scenes: Scenes, paths: Any, wanted: Any, *values: Tensor) -> Any:
+    def vmap(info: Any, dims: tuple[Any, ...], module: Runs, paths: Any, wanted: Any, *values: Tensor) -> Any:
         # Tensors of one shape, with the mapped dimension first in all of them.
         each = [
             one.movedim(dim, 0) if dim is not None else one.expand(info.batch_size, *one.shape)
             for one, dim in zip(values, dims[3:], strict=True)
         ]
-        return _Run.apply(scenes, paths, wanted, *each), 0
+        return _Run.apply(module, paths, wanted, *each), 0
 
 
 def _slopes(ctx: Any, wanted: tuple[str, ...]) -> Tensor:
     """Derivatives of a run's outputs by the parameters `wanted`."""
     refuse(ctx.wanted, "second derivatives of a run are asked for; allowed: first derivatives")
-    return _Run.apply(ctx.scenes, ctx.paths, wanted, *ctx.saved_tensors)
+    return _Run.apply(ctx.module, ctx.paths, wanted, *ctx.saved_tensors)

@@ -100,11 +100,6 @@ class Task:
         self.paths: dict[str, tuple[str, ...]] = {}
         self.clock: str | None = None  # The frequency of the only source, if it is one of `paths`
 
-    def begin(self, values: dict[str, FloatArray]) -> None:
-        """Take these arrays for the values; no scene is done."""
-        self.values, self.error, self.status = values, np.full(self.n, np.nan), np.full(self.n, -1, np.int8)
-        self.messages, self.ordinary = {}, ""
-
     def count(self, frequency: FloatArray) -> FloatArray:
         """Number of periods in runs with sources of these frequencies (Hz)."""
         return np.full(self.n, self.periods) if self.t_stop is None else np.asarray(frequency * self.t_stop)
@@ -303,15 +298,16 @@ def batch(
     # Figures of several GAPs have one column each.
     size, each = n * width * max(gaps, 1), (gaps,) if gaps > 1 else ()
     require(size <= _MOST_VOLTAGES, "outputs", f"of {size:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
-    task.begin({name: np.full((n, *each), np.nan) for name in task.outputs if name != "u_gap"})
+    task.values = {name: np.full((n, *each), np.nan) for name in task.outputs if name != "u_gap"}
     if task.traced:
         # This memory, which is much, is taken by the threads that write it.
         task.values["u_gap"] = np.empty((n, width, *each))
+    task.status = np.full(n, -1, np.int8)
     with ThreadPoolExecutor(threads) as pool:
         _find(task, why or form, pool)
         if slopes is not None:
-            slopes.begin({name: np.full((n, len(slopes.paths)), np.nan) for name in slopes.outputs})
-            slopes.status = np.where(task.status >= REFUSED, task.status, slopes.status)
+            slopes.values = {name: np.full((n, len(slopes.paths)), np.nan) for name in slopes.outputs}
+            slopes.status = np.where(task.status >= REFUSED, task.status, np.int8(-1))
             form = lockstep_form(circuit, slopes.scenes)
             unlike = why_alone(form, slopes.outputs, slopes.rtol)
             if not unlike and slopes.clock is not None and slopes.t_stop is not None:
@@ -328,9 +324,10 @@ def batch(
 def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> None:
     """Find what a task asks for in all scenes that are not done; `form` may be why none of them goes in lockstep."""
     ladder = Slopes if task.paths else Ladder
+    task.error, task.messages, task.ordinary = np.full(task.n, np.nan), {}, ""
     if isinstance(form, LockstepForm):
         # Jobs have no scene in common, so that threads write to different places.
-        list(pool.map(lambda job: ladder(task, form, job[1]).climb(job[0]), _jobs(task, form)))
+        list(pool.map(lambda job: ladder(task, form, *job).climb(), _jobs(task, form)))
     rest, task.n_ordinary = np.flatnonzero(task.status < 0), int(np.count_nonzero(task.status != LOCKSTEP))
     if task.traced:
         task.values["u_gap"][rest] = np.nan

@@ -246,23 +246,15 @@ def curves_of(m: float, n: float, degree: int) -> tuple[FloatArray, FloatArray, 
     return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), at, np.ascontiguousarray(highest_first)
 
 
-class Level(NamedTuple):
-    """The steps of an integration."""
+class Run(NamedTuple):
+    """Results of `march` with all steps and with half of them, and the gap voltages of both; a column each."""
 
-    halves: int  # Length of the runs in half periods
-    pieces: int  # Of a half period, each twice as long as the one before; 0 for a source that is no square
-    covered: float  # As `_COVERED`
     steps: int  # Of a period (sample)
     degree: int  # Of the area's polynomial
-
-
-class Run(NamedTuple):
-    """Results of `march` with half the steps and with all steps, and the gap voltages of both; a column each."""
-
-    coarse: FloatArray
     fine: FloatArray
-    trace_coarse: FloatArray
     trace: FloatArray
+    coarse: FloatArray
+    trace_coarse: FloatArray
 
 
 class Ladder:
@@ -281,8 +273,9 @@ class Ladder:
     gives_up = True  # Whether scenes are given up for which more steps are no help
     named = ""  # What comes before the message of a scene that cannot be run
 
-    def __init__(self, task: Task, form: LockstepForm, members: IntArray) -> None:
+    def __init__(self, task: Task, form: LockstepForm, halves: int, members: IntArray) -> None:
         self.task, self.form = task, form
+        self.halves = halves  # Length of the runs in half periods
         self.members = members  # (n,): Places of the scenes in the task
         # Values by path in lower case, (copies n,)
         self.scenes = {path.lower(): array[members] for path, array in task.scenes.items()}
@@ -299,7 +292,8 @@ class Ladder:
         rates = leaks / (table[:cells] * table[others + OMEGA])
         # Smallest leakage rate, in periods over 2 pi; and half a period in time constants of the fastest cell
         self.slowest, self.decays = rates.min(axis=0), np.max(rates, axis=0) * np.pi
-        self.pieces = np.zeros(table.shape[1], int)  # As in `Level`
+        # Pieces of a half period, each twice as long as the one before; 0 for a source that is no square
+        self.pieces = np.zeros(table.shape[1], int)
         first: FloatArray | float = 0.0
         if form.jumping:
             # Gap voltages at equal distances need a single piece.
@@ -317,10 +311,10 @@ class Ladder:
         # run whose source is not 0 V at its start, lasts for a time constant of the fastest cell or less.
         self.least = 2.0 * first * self.decays
 
-    def climb(self, halves: int) -> None:
-        """Find what is wanted in runs of so many half periods; scenes whose error stays too large stay not done."""
+    def climb(self) -> None:
+        """Find what is wanted; scenes whose error stays too large stay not done."""
         # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
-        order = np.argsort(self.slowest) if halves > 4 else np.arange(self.members.size)
+        order = np.argsort(self.slowest) if self.halves > 4 else np.arange(self.members.size)
         rtol, highest, points = self.task.rtol, max(self.form.multiples), self.task.points
         _, one, several, of_piece, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
         for pieces in np.unique(self.pieces[self.possible]).tolist():
@@ -333,26 +327,26 @@ class Ladder:
                 steps = each * -(-steps // each)
             pending = order[(self.possible & (self.pieces == pieces))[order]]
             for covered in _COVERED:
-                pending = self._climb(Level(halves, pieces, covered, steps, degree), pending)
+                pending = self._climb(pending, covered, steps, degree)
 
-    def _climb(self, level: Level, pending: IntArray) -> IntArray:
+    def _climb(self, pending: IntArray, covered: float, steps: int, degree: int) -> IntArray:
         """Find what is wanted of scenes, and return those whose gap voltage the area's polynomial does not serve."""
         form, task, rtol = self.form, self.task, self.task.rtol
         most = _MOST_STEPS * max(form.multiples) if form.recording is None else _PARTS[1]
         # No degree whose rounding is too large.
         highest = self.highest_degree if 0.3 * rtol > 2.0**self.highest_degree * _EPS else 16
-        before: tuple[FloatArray, FloatArray] | None = None  # Results and gap voltages with half the steps
+        before: Run | None = None  # With half the steps
         last, outside = np.full(pending.size, np.inf), [pending[:0]]
-        while pending.size and level.steps <= most:
-            run = self._run(level, self._columns(pending), before)
+        while pending.size and steps <= most:
+            run = self._run(pending, covered, steps, degree, before)
             if run is None:
                 break
-            error, resolved = self.error(level, run, pending), self.least[pending] <= level.steps
+            error, resolved = self.error(run, pending), self.least[pending] <= steps
             error = np.where(np.isfinite(last), np.maximum(error, last / self.most_gain), error)
             # What decays after a start away from 0 V may have the same error with half the steps, once.
             once = (before is None) & (self.least > self.decays)[pending]
             good = (error <= ENOUGH * self.limit * rtol) & resolved & ~once
-            self.enter(level, run, pending, good)
+            self.enter(run, pending, good)
             at = self.members[pending[good]]
             task.error[at], task.status[at] = error[good] / self.stated, LOCKSTEP
             tail = run.fine[-1].reshape(self.copies, -1)
@@ -361,24 +355,24 @@ class Ladder:
                 # A scene whose estimate grows from twice the steps: the explicit steps may be unstable around that
                 # area. And where the area's polynomial of the highest degree is what limits the error.
                 beyond |= ~good & resolved & (error > last)
-                left &= (tail <= ENOUGH * rtol).all(axis=0) | (level.degree < highest or before is None)
+                left &= (tail <= ENOUGH * rtol).all(axis=0) | (degree < highest or before is None)
             left &= ~beyond
             outside.append(pending[beyond])
             kept = np.tile(left, self.copies)
-            before, last, pending = (run.fine[:, kept], run.trace[kept]), error[left], pending[left]
+            before, last = run._replace(fine=run.fine[:, kept], trace=run.trace[kept]), error[left]
+            pending, steps = pending[left], 2 * steps
             more = _MORE_DEGREE if tail[:, left].max(initial=0.0) > _SMALL_TAIL * rtol else 0
-            degree = max(level.degree, min(level.degree + more, highest))
-            level = level._replace(steps=2 * level.steps, degree=degree)
+            degree = max(degree, min(degree + more, highest))
         return np.concatenate(outside)
 
     def _columns(self, some: IntArray) -> IntArray:
         """Places of all copies of some scenes in the table."""
         return np.add.outer(np.arange(self.copies) * self.members.size, some).ravel()
 
-    def _run(self, level: Level, columns: IntArray, before: tuple[FloatArray, FloatArray] | None) -> Run | None:
-        """Integrate columns of the table, for half the steps, too, where `before` has no results; None: no curve."""
-        task, form, halves, steps = self.task, self.form, level.halves, level.steps
-        curves = curves_of(form.gap.values["m_exp"], form.gap.values["n_exp"], level.degree)
+    def _run(self, pending: IntArray, covered: float, steps: int, degree: int, before: Run | None) -> Run | None:
+        """Integrate scenes, for half the steps, too, where `before` has no results; None: no curve."""
+        task, form, halves, columns = self.task, self.form, self.halves, self._columns(pending)
+        curves = curves_of(form.gap.values["m_exp"], form.gap.values["n_exp"], degree)
         if curves is None:
             return None
         sizes = steps // 2 if before is None else 0, steps
@@ -388,23 +382,25 @@ class Ladder:
         assert form.stack.gap is not None
         devices = [form.stack.layers[i].device for i in form.stack.layer_of]
         leaks: IntArray = np.array([i for i, device in enumerate(devices) if device in ("LAYER", "GAP")])
-        lengths = form.stack.c.size - 1, waves[1].shape[1], leaks.size, level.degree + 1, self.n_moment
+        lengths = form.stack.c.size - 1, waves[1].shape[1], leaks.size, degree + 1, self.n_moment
         marks, scenes = marks_of(*lengths), (self.table, columns, (form.stack.gap, leaks), curves)
-        block = new_block(self.table.shape[0], level.pieces, marks)
+        pieces = int(self.pieces[pending[0]])
+        block = new_block(self.table.shape[0], pieces, marks)
         if form.recording is not None:
             out = np.empty((2, (1 + N_PORTION) * self.n_moment + 3, columns.size))
             values = form.recording.between(0, halves + 1) / peak_of(form.recording)
-            march_samples(scenes, values, (sizes, level.covered), block, out, marks)
+            march_samples(scenes, values, (sizes, covered), block, out, marks)
         else:
             source = np.array(form.multiples, float), waves
             tol = (_CLOSING if task.periodic else _SETTLED) * (task.rtol * self.closer)
-            how = halves, steps // 2, level.pieces, task.periodic, tol, level.covered
+            how = halves, steps // 2, pieces, task.periodic, tol, covered
             if task.device == "cuda":
                 out = march_on_card(scenes, source, how, _MOST_PIECES if form.jumping else 0, lengths)
             else:
                 out = np.empty((2, 2 * self.n_moment + 3, columns.size))
                 march(scenes, source, how, block, out, (coarse, fine), marks)
-        return Run(out[0], out[1], coarse, fine) if before is None else Run(before[0], out[1], before[1], fine)
+        halved = (out[0], coarse) if before is None else (before.fine, before.trace)
+        return Run(steps, degree, out[1], fine, *halved)
 
     def figure(self, name: str, m: FloatArray, columns: IntArray) -> FloatArray:
         """An output of some columns of the table, from their moments."""
@@ -423,7 +419,7 @@ class Ladder:
         force = (gap.values["mu"] if mu is None else mu[columns]) * normal
         return np.asarray(force if signal == "f_t" else force / load)
 
-    def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
+    def enter(self, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Put what is wanted of the scenes that are `good` among `pending` into the task."""
         at = pending[good]
         for name in self.names:
@@ -432,39 +428,36 @@ class Ladder:
             moments = run.fine[first : first + self.n_moment, good]
             self.task.values[name][self.members[at]] = self.figure(name, moments, at)
         if self.task.traced:
-            u, some = self.task.values["u_gap"], run.trace[good, :: level.steps // self.task.points]
+            u, some = self.task.values["u_gap"], run.trace[good, :: run.steps // self.task.points]
             u[self.members[at]] = np.pad(some, ((0, 0), (0, u.shape[1] - some.shape[1])), constant_values=np.nan)
 
-    def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
+    def error(self, run: Run, pending: IntArray) -> FloatArray:
         """Estimated error of the scenes `pending`: the largest of all outputs, relative to themselves."""
         peak, closing, tail = run.fine[-3:]
-        changes = [np.zeros(peak.size)]
-        for row in self.needed:
-            size, change = np.abs(run.fine[row]), np.abs(run.fine[row] - run.coarse[row])
-            later = row + self.n_moment
-            if self.form.recording is not None:
-                # Each zero of the gap voltage adds an error as if by chance, so that the sum of all may be small by
-                # chance with half the steps, and not with all of them. The root of the sum of their squares is not.
-                portions = slice(later, -3, self.n_moment)
-                change = np.maximum(change, np.linalg.norm(run.fine[portions] - run.coarse[portions], axis=0))
-            elif level.halves > 1:
-                last = np.abs(run.fine[later])
-                changes.append(np.abs(run.fine[later] - run.coarse[later]) / np.where(last > 0.0, last, 1.0))
-            changes.append(change / np.where(size > 0.0, size, 1.0))
+        # Of the moments that are needed, in the whole run and in its parts, of shape (n_part + 1, n_needed, n)
+        fine, coarse = (x[:-3].reshape(-1, self.n_moment, peak.size)[:, self.needed] for x in (run.fine, run.coarse))
+        size, change = np.abs(fine), np.abs(fine - coarse)
+        if self.form.recording is not None:
+            # Each zero of the gap voltage adds an error as if by chance, so that the sum of all may be small by chance
+            # with half the steps, and not with all of them. The root of the sum of their squares is not.
+            change[0] = np.maximum(change[0], np.linalg.norm(change[1:], axis=0))
+        if self.form.recording is not None or self.halves == 1:
+            size, change = size[:1], change[:1]
+        off = (change / np.where(size > 0.0, size, 1.0)).max(axis=(0, 1))
         if self.task.traced:
-            off = np.abs(run.trace[:, : 2 * run.trace_coarse.shape[1] : 2] - run.trace_coarse).max(axis=1)
-            changes.append(off / np.where(peak > 0.0, peak, 1.0))
+            missed = np.abs(run.trace[:, : 2 * run.trace_coarse.shape[1] : 2] - run.trace_coarse).max(axis=1)
+            off = np.maximum(off, missed / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
-        change, decays = np.max(changes, axis=0) + run.coarse[-1], self.decays[pending]
+        change, decays = off + run.coarse[-1], self.decays[pending]
         # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
-        begins = 2.0 * decays > _STIFF * level.steps
+        begins = 2.0 * decays > _STIFF * run.steps
         more = np.where(self.task.traced | begins | (self.least[pending] > decays), _STATED_MORE, _STATED)
-        share: FloatArray | float = np.where(begins & (level.halves <= 2), _STATED_BEGINNING, more)
+        share: FloatArray | float = np.where(begins & (self.halves <= 2), _STATED_BEGINNING, more)
         if self.form.recording is not None:
             share = _STATED_RECORDED if self.form.stack.c.size == len(self.form.stack.layers) else _STATED_DISPERSIVE
         elif self.form.jumping:
             share = _STATED_JUMPING
-        return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING + 2.0**level.degree * _EPS)
+        return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING + 2.0**run.degree * _EPS)
 
 
 class Slopes(Ladder):
@@ -485,8 +478,8 @@ class Slopes(Ladder):
     gives_up = False
     named = "gradients: "
 
-    def __init__(self, task: Task, form: LockstepForm, members: IntArray) -> None:
-        super().__init__(task, form, members)
+    def __init__(self, task: Task, form: LockstepForm, halves: int, members: IntArray) -> None:
+        super().__init__(task, form, halves, members)
         self.given = np.array([self.scenes[path.lower()] for path in task.paths])  # (n_parameter, n)
         self.possible &= (np.isfinite(self.given) & (self.given != 0.0)).all(axis=0)
         self.copies = 2 * len(task.paths)
@@ -497,14 +490,14 @@ class Slopes(Ladder):
         self.scenes = {path: array.ravel() for path, array in moved.items()}
         self.table = table_of(form, self.scenes)
 
-    def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
+    def enter(self, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Per unit of the parameter."""
         at = pending[good]
         change, _ = self._changes(run.fine[0], pending)
         for j, name in enumerate(self.task.outputs):
             self.task.values[name][self.members[at]] = (change[j][:, good] / self.given[:, at]).T
 
-    def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
+    def error(self, run: Run, pending: IntArray) -> FloatArray:
         """For a change of a parameter by all of itself, relative to the output; the largest of all."""
         (_, own), (_, coarse) = (self._changes(each[0], pending) for each in (run.fine, run.coarse))
         largest = np.abs(own).max(axis=(0, 1))
@@ -513,8 +506,8 @@ class Slopes(Ladder):
         cut = STEP**2 / 6.0 * largest * (largest + 1.0) * (largest + 2.0)
         closing, tail = run.fine[-2:].reshape(2, self.copies, -1).max(axis=1)
         # The polynomial's error is one of Chebyshev's, whose slope is larger by its degree.
-        tail = level.degree * (tail + run.coarse[-1].reshape(self.copies, -1).max(axis=0))
-        noise = 2.0 * closing + _ROUNDING_OF_SLOPES + 2.0**level.degree * _EPS
+        tail = run.degree * (tail + run.coarse[-1].reshape(self.copies, -1).max(axis=0))
+        noise = 2.0 * closing + _ROUNDING_OF_SLOPES + 2.0**run.degree * _EPS
         return np.asarray(_STATED_SLOPES * change + cut + tail + noise / STEP)
 
     def _changes(self, mean: FloatArray, pending: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ import warnings
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from inspect import signature
@@ -102,8 +102,7 @@ class Work:
         self.chunks = math.prod(self._grid)
         require(self.chunks <= MOST_CHUNKS, "the sweep", f"{math.prod(plan.sizes):,} scenes", "at most "
                 f"{MOST_CHUNKS:,} chunks of {math.prod(self.block):,}")  # fmt: skip
-        if plan.drawn:
-            plan.divide(self.block[-1])
+        plan.count = self.block[-1] if plan.drawn else plan.n
         # With ``error`` and, as the last, ``status``
         self.outputs = {
             str(name): Array(
@@ -272,21 +271,20 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     except ImportError:
         raise InputError(f"{'scheduler' if workers is None else 'workers'} takes the package distributed, which is not "
                          "installed; allowed: pip install 'fingerspice[cluster]'") from None  # fmt: skip
-    with ExitStack() as held:
-        try:
-            if workers is not None:
-                cluster = distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",
-                    silence_logs=logging.CRITICAL,
-                )  # fmt: skip
-                scheduler = held.enter_context(cluster).scheduler_address
-            client = held.enter_context(distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False))
-        except (OSError, ValueError, ImportError, RuntimeError) as error:
-            fault, hint = "the workers did not start", "in a script, allowed: workers under if __name__ == '__main__'"
-            if workers is None:
-                fault = f"no scheduler answers at {scheduler}"
-                hint = "allowed: the address that `dask scheduler` tells, such as tcp://10.0.0.1:8786"
-            raise InputError(f"{fault} ({type(error).__name__}); {hint}") from None
+    own = {
+        "n_workers": workers, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": "127.0.0.1:0",
+        "silence_logs": logging.CRITICAL,
+    }  # fmt: skip
+    try:
+        client = distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False, **(own if workers else {}))
+    except (OSError, ValueError, ImportError, RuntimeError) as error:
+        fault, hint = "the workers did not start", "in a script, allowed: workers under if __name__ == '__main__'"
+        if workers is None:
+            fault = f"no scheduler answers at {scheduler}"
+            hint = "allowed: the address that `dask scheduler` tells, such as tcp://10.0.0.1:8786"
+        raise InputError(f"{fault} ({type(error).__name__}); {hint}") from None
+    # Workers that it has started end with it.
+    with client:
         yield client
 
 

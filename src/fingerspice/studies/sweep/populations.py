@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from functools import lru_cache, reduce
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice import sets
-from fingerspice.base.arrays import FloatArray, real_number, real_numbers, whole_number
+from fingerspice.base.arrays import FloatArray, Remembering, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
@@ -38,7 +38,7 @@ RESAMPLES = 499
 _NUMBERS = "a number, an array of numbers, or a frozen distribution of scipy.stats such as norm(3.5e-6, 0.3e-6)"
 
 
-class Plan:
+class Plan(Remembering):
     """Parameters of a circuit that make a grid, those that are drawn, and those that are one number, by name.
 
     Names are paths, several paths with commas, whose numbers are factors, or kinds of sets, whose numbers count them.
@@ -50,8 +50,7 @@ class Plan:
         good = isinstance(asked, Mapping) and bool(asked)
         require(good, "parameters", asked, "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
         self.n, self.seed = n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
-        # Draws of a part, and by each bit of its number what that adds to their bits
-        self.count, self._steps = n, list[NDArray[np.int64]]()
+        self.count = n  # Draws of a part: a power of two
         power = most.bit_length() - 1
         require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
         # The paths of each name, with the value that its numbers are factors of, or the values of the sets, (n_set,)
@@ -119,21 +118,17 @@ class Plan:
         points = np.clip(points, _EDGE, 1.0 - _EDGE)
         return {path: np.asarray(law.ppf(points[:, i]), float) for i, (path, law) in enumerate(self.drawn.items())}
 
-    def divide(self, count: int) -> None:
-        """Let the draws come in parts of `count` (a power of two, at most `n`), each of which costs the same."""
-        starts = [count << i for i in range((self.n // count).bit_length() - 1)]
-        self.count, self._steps = count, [self._bits(start, 1) ^ self._bits(0, 1) for start in starts]
-
-    # A process that is sent the plan makes the bits of the first part once.
-    @lru_cache(2)  # noqa: B019
     def _bits(self, start: int, count: int) -> NDArray[np.int64]:
-        """Bits of so many points of the unit cube from one on, shape (count, n_drawn)."""
+        """Bits of so many points of the unit cube from one on, shape (count, n_drawn), which a process makes once."""
         from scipy.stats import qmc
 
-        engine = qmc.Sobol(len(self.drawn), scramble=True, bits=BITS, rng=self.seed)
-        if start:
-            engine.fast_forward(start)
-        return np.asarray(engine.random(count) * 2.0**BITS, np.int64)
+        def bits() -> NDArray[np.int64]:
+            engine = qmc.Sobol(len(self.drawn), scramble=True, bits=BITS, rng=self.seed)
+            if start:
+                engine.fast_forward(start)
+            return np.asarray(engine.random(count) * 2.0**BITS, np.int64)
+
+        return self.remember(("bits", start, count), bits, BITS + 1)
 
     # Two chunks may run at once, and those after them mostly have the same draws.
     @lru_cache(2)  # noqa: B019
@@ -145,8 +140,11 @@ class Plan:
         """
         if not self.drawn:
             return {}
-        added = (step for i, step in enumerate(self._steps) if number >> i & 1)
-        return self.quantiles(np.asarray(reduce(np.bitwise_xor, added, self._bits(0, self.count)) * 2.0**-BITS, float))
+        bits = first = self._bits(0, self.count)
+        for i in range(number.bit_length()):
+            if number >> i & 1:
+                bits = bits ^ (self._bits(self.count << i, 1) ^ first[0])
+        return self.quantiles(np.asarray(bits * 2.0**-BITS, float))
 
 
 def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, tuple[str, ...], dict[str, FloatArray]]:
@@ -322,29 +320,24 @@ def _indices(
     """Indices (n_output, d), their intervals, and mean and standard deviation of the outputs, at one place."""
     from scipy.stats import qmc
 
-    def figures(x: FloatArray) -> FloatArray:
-        found = batch(plan.circuit, plan.spread(place, dict(zip(plan.drawn, x, strict=True))), **options)
-        if lost := int(np.count_nonzero(found.status >= REFUSED)):
-            raise InputError(f"{lost} of {found.sizes['scene']} scenes have no result ({found.attrs['failures'][0]}), "
-                             "and indices need all; allowed: distributions that stay where the circuit "
-                             "works")  # fmt: skip
-        values = np.array([found[name].values for name in outputs])
-        require(values.ndim == 2, "outputs", "one for each of several gaps", "figures of a circuit with one GAP")
-        return values
-
-    # Two populations, and for each parameter the first one with that parameter of the second.
-    d, laws = len(plan.drawn), list(plan.drawn.values())
-    points = qmc.Sobol(2 * d, bits=64, rng=plan.seed).random(plan.n).T
-    pair = np.array([law.ppf(x) for law, x in zip(laws * 2, points, strict=True)], float).reshape(2, d, plan.n)
-    other = np.repeat(pair[:1], d, axis=0)
-    other[np.arange(d), np.arange(d)] = pair[1]
-    a, b = map(figures, pair)
-    mixed = np.moveaxis(figures(np.moveaxis(other, 0, -1).reshape(d, -1)).reshape(len(outputs), plan.n, d), -1, 0)
-    # Then each parameter by itself.
-    alone = np.full((d, len(QUANTILES), d), 0.5)
-    alone[np.arange(d), :, np.arange(d)] = QUANTILES
-    x = np.array([law.ppf(alone[..., j].ravel()) for j, law in enumerate(laws)])
-    picks = np.random.default_rng(plan.seed).integers(0, plan.n, (RESAMPLES, plan.n))
+    # Two populations, for each parameter the first one with that parameter of the second, and each parameter by itself.
+    n, d, laws = plan.n, len(plan.drawn), list(plan.drawn.values())
+    points = qmc.Sobol(2 * d, bits=64, rng=plan.seed).random(n).T
+    pair = np.array([law.ppf(x) for law, x in zip(laws * 2, points, strict=True)], float).reshape(2, d, n)
+    middle = np.array([law.ppf(np.full(len(QUANTILES), 0.5)) for law in laws], float)
+    other, alone = (np.repeat(x[None], d, axis=0) for x in (pair[0], middle))
+    for k, law in enumerate(laws):
+        other[k, k], alone[k, k] = pair[1, k], law.ppf(QUANTILES)
+    draws = dict(zip(plan.drawn, np.concatenate([*pair, *other, *alone], axis=1), strict=True))
+    found = batch(plan.circuit, plan.spread(place, draws), **options)
+    if lost := int(np.count_nonzero(found.status >= REFUSED)):
+        raise InputError(f"{lost} of {found.sizes['scene']} scenes have no result ({found.attrs['failures'][0]}), and "
+                         "indices need all; allowed: distributions that stay where the circuit works")  # fmt: skip
+    values = np.array([found[name].values for name in outputs])
+    require(values.ndim == 2, "outputs", "one for each of several gaps", "figures of a circuit with one GAP")
+    a, b, mixed, single = np.split(values, [n, 2 * n, (2 + d) * n], axis=1)
+    mixed = np.moveaxis(mixed.reshape(len(outputs), d, n), 1, 0)
+    picks = np.random.default_rng(plan.seed).integers(0, n, (RESAMPLES, n))
     drawn = np.array([_saltelli(a[:, pick], b[:, pick], mixed[..., pick]) for pick in picks])
     low, high = np.quantile(drawn, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence], axis=0)
     both, (first, total) = np.concatenate([a, b], axis=1), _saltelli(a, b, mixed)
@@ -352,7 +345,7 @@ def _indices(
         "first": first, "first_low": low[0], "first_high": high[0],
         "total": total, "total_low": low[1], "total_high": high[1],
         "mean": both.mean(axis=1), "std": both.std(axis=1),
-        "alone": figures(x).reshape(len(outputs), d, len(QUANTILES)),
+        "alone": single.reshape(len(outputs), d, len(QUANTILES)),
     }  # fmt: skip
 
 
@@ -378,10 +371,9 @@ def ranking(found: Dataset, output: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for index in np.ndindex(*(found.sizes[dim] for dim in dims)):
         one = found.isel(dict(zip(dims, index, strict=True)))
-        figures = {key: one[f"{output}_{kind}"].values for key, kind in kinds.items()}
         place = {dim: one[dim].item() for dim in dims}
-        for j in np.argsort(-figures["total"], kind="stable"):
-            numbers = {key: float(values[j]) for key, values in figures.items()}
+        for j in np.argsort(-one[f"{output}_total"].values, kind="stable"):
+            numbers = {key: float(one[f"{output}_{kind}"][j]) for key, kind in kinds.items()}
             rows.append({"place": place, "parameter": str(one.parameter.values[j]), **numbers})
     return rows
 
