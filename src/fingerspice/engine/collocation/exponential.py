@@ -314,22 +314,22 @@ def carry(circuit: Any, state: Any, gap: FloatArray, answer: float) -> None:
 def mode_error(
     x: Modal, k: int, lin: tuple[float, float, float], tables: Tables, slot: int, rows: tuple[int, int, int, int],
     magnified: float, error: float, off: FloatArray,
-) -> tuple[float, float, float]:  # fmt: skip
+) -> None:  # fmt: skip
     """Fill `places` with the errors of mode k at a step's start, the points between its nodes, and its end.
 
     They are the interpolation error of the forcing, of which `lin` is that of the linear part; the residual of the
     iteration; and the `error` at the start as carried on. The first has the response at `rows`, which goes into `off`
-    (4, m); it and the second are `magnified`. Returned is the interpolation error of the mode itself.
+    (4, m); it and the second are `magnified`. The interpolation error of the mode itself goes into `brief`.
     """
     pull, left, miss = between(tables.lobes, x.pull[k]), x.spare[5, k], tables.miss[slot, k]
-    places, carried = x.places[k], x.carried[k]
+    places, carried, brief = x.places[k], x.carried[k], x.brief[k]
     missed = largest((lin[0] + pull[0]) / MISS[0], (lin[1] + pull[1]) / MISS[1], (lin[2] + pull[2]) / MISS[2])
     left_over(tables.phi[slot, k], x.pull[k], x.used[k], left)
     places[0] = error
     for p in range(4):
         off[p, k] = magnified * miss[rows[p]] * missed
         places[p + 1] = carried[p] + magnified * left[p] + off[p, k]
-    return between(tables.lobes, x.w[k])
+    brief[1], brief[2], brief[3] = between(tables.lobes, x.w[k])
 
 
 @jit_rows

@@ -26,10 +26,9 @@ from fingerspice.engine.collocation.readout import CONTROL, N_PLACES, Modal, new
 from fingerspice.engine.many_areas import coupling as couplings
 from fingerspice.engine.network import Sources
 from fingerspice.engine.one_area import rows as stack_rows
-from fingerspice.engine.one_area.rows import polynomial_rows
-from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, POINTS, ROWS, combine, multiply
+from fingerspice.engine.one_area.rows import area_rows
+from fingerspice.numerics.lobatto import NODES, POINTS, ROWS, TO_SLOPES, combine, multiply
 from fingerspice.numerics.modes import copy_to
-from fingerspice.physics.contact import inverse_area
 
 # Blocks of the cells' rows: the parts of eta and chi that follow the sources, eta and chi, rho, shares of A', voltages,
 # currents.
@@ -110,7 +109,7 @@ class Jump(NamedTuple):
     # control (2,), sign: Bookkeeping before the jump and at its start, and branches of the areas before it
     control: NDArray[Any]
     sign: FloatArray
-    branch: FloatArray  # (n_area, 2): As `ManyAreas.branch`, by the fraction of the jump
+    branch: FloatArray  # (n_area, 2): `ManyAreas.branch` before it; within a jump it goes by the fraction of the jump
 
 
 class Work(NamedTuple):
@@ -165,10 +164,6 @@ def form_of(c: Any, s: Any) -> Form:
     return form
 
 
-# From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
-TO_RATES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN.T @ DERIVATIVE]).T)
-
-
 @jit_rows
 def mode_rates(
     h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, pull: FloatArray, stiff_only: bool, out: FloatArray
@@ -180,7 +175,7 @@ def mode_rates(
             for i in range(ROWS):
                 total = 0.0
                 for m in range(NODES):
-                    total += TO_RATES[m, i] * w[k, m]
+                    total += TO_SLOPES[m, i] * w[k, m]
                 out[k, i] = total / h
         elif not stiff_only:
             for i in range(ROWS):
@@ -203,33 +198,22 @@ def _highest(sign: float, u: FloatArray) -> float:
 
 
 @jit_rows
-def _invert(area: FloatArray) -> None:
+def _inverted(q: FloatArray, dq: FloatArray, slopes_too: bool) -> None:
+    """The area and, if wanted, its slope in place of 1/A and the slope of that."""
     for i in range(ROWS):
-        area[i] = 1.0 / area[i]
-
-
-@jit_rows
-def _scale_slope(factor: float, area: FloatArray, slope: FloatArray) -> None:
-    for i in range(ROWS):
-        slope[i] *= factor * area[i] * area[i]
+        q[i] = 1.0 / q[i]
+    if slopes_too:
+        for i in range(ROWS):
+            dq[i] *= -q[i] * q[i]
 
 
 @jit
 def wanted(form: Form, a: int, slopes_too: bool, sign: float, areas: FloatArray) -> None:
     """Area a at its gap voltages on the branch of a sign and, if wanted, its derivative by them."""
-    curve, lo, scale = form.curves[a], form.lo[a], form.scale[a]
-    u, area, slope = areas[U, a], areas[AREA, a], areas[SLOPE, a]
-    if scale > 0.0 and _highest(sign, u) <= curve[1]:
-        polynomial_rows(form.powers[a], lo, scale, u, sign, area)
-        _invert(area)
-        if slopes_too:
-            polynomial_rows(form.slopes[a], lo, scale, u, sign, slope)
-            _scale_slope(-scale * sign, area, slope)
-    else:
-        for i in range(ROWS):
-            q, dq = inverse_area(max(sign * u[i], lo), curve)
-            area[i] = 1.0 / q
-            slope[i] = -sign * dq / (q * q)
+    curve, u, area, slope = form.curves[a], areas[U, a], areas[AREA, a], areas[SLOPE, a]
+    scale = form.scale[a] if _highest(sign, u) <= curve[1] else 0.0
+    area_rows(form.powers[a], form.slopes[a], form.lo[a], scale, curve, u, sign, slopes_too, area, slope)
+    _inverted(area, slope, slopes_too)
 
 
 @jit_rows

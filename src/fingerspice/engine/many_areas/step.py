@@ -105,12 +105,6 @@ class ManyAreas(NamedTuple):
     branch: FloatArray  # (n_area, 2): Time at which each area's branch began, and length of the branch before, s
 
 
-@jit_within
-def branch_of(c: ManyAreas, s: LoopState) -> FloatArray:
-    """Where the areas' branches began: in time, or within a jump."""
-    return c.work.jump.branch if s.step[0].in_jump > 0 else c.branch
-
-
 @jit
 def start(c: ManyAreas, s: LoopState) -> None:
     """Begin a call of the loop, or go on after a pause, which changes nothing."""
@@ -151,7 +145,7 @@ def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
     else:
         if step.has_begun > 0 and control.t >= t_end:
             return readout.DONE
-        if counters[readout.ACCEPTED] >= step.pause_at or counters[readout.RECORDED] >= s.steps.times.shape[0] > 0:
+        if counters[readout.ACCEPTED] >= step.pause_at or counters[readout.RECORDED] >= s.steps.times.shape[0]:
             step.is_paused = 1
             return readout.PAUSED
         _look_at_sources(c, s, t_end)
@@ -207,7 +201,8 @@ def _enter_jump(c: ManyAreas, s: LoopState) -> None:
     copy_to(jump.sign, c.sign)
     copy_to(jump.before, c.s_before)
     copy_to(jump.after, c.work.now)
-    jump.branch[:] = 0.0
+    copy_to(jump.branch, c.branch)
+    c.branch[:] = 0.0
     s.control[0] = jump.control[1]
     control.error_q, control.magnified = jump.control[0].error_q, jump.control[0].magnified
     s.step[0].tabled, s.step[0].stop = 0.0, 1.0
@@ -232,6 +227,7 @@ def resume_time(c: ManyAreas, s: LoopState) -> None:
     jump, control = c.work.jump, s.control[0]
     jump.control[0].error_q, jump.control[0].magnified = control.error_q, control.magnified
     s.control[0] = jump.control[0]
+    copy_to(c.branch, jump.branch)
     s.step[0].in_jump = 0
 
 
@@ -239,7 +235,7 @@ def resume_time(c: ManyAreas, s: LoopState) -> None:
 def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
     """The areas at the start of a step and, where it is not known yet, the branch of each; the next zero to expect."""
     form, work, control, sign = c.form, c.work, s.control[0], c.sign
-    branch, in_jump, w0, now = branch_of(c, s), s.step[0].in_jump > 0, work.modal.w0, work.now
+    branch, in_jump, w0, now = c.branch, s.step[0].in_jump > 0, work.modal.w0, work.now
     ahead = math.inf
     control.branch_start, control.branch_length = t, math.inf
     for a in range(sign.size):
@@ -297,7 +293,7 @@ def _take_coupling(c: ManyAreas, s: LoopState, h: float) -> None:
 def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
     form, work, x, step, tol = forms.form_of(c, s), c.work, c.work.modal, s.step[0], pace.tol
-    branch, t, in_jump, h, u = branch_of(c, s), s.control[0].t, s.step[0].in_jump > 0, s.step[0].length, x.u
+    branch, t, in_jump, h, u = c.branch, s.control[0].t, s.step[0].in_jump > 0, s.step[0].length, x.u
     if h != step.tabled:
         exponential.take_tables(c, s, -1 if in_jump else work.at[0], h, form.rates, work.size)
         _take_coupling(c, s, h)
@@ -370,8 +366,7 @@ def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     _cut_at_zero(c, pace, s, turned_enough)
     a = step.crossed
     if a >= 0 and step.t_new <= t:
-        branch = branch_of(c, s)
-        c.sign[a], branch[a, 0], branch[a, 1] = -c.sign[a], t, math.inf
+        c.sign[a], c.branch[a, 0], c.branch[a, 1] = -c.sign[a], t, math.inf
         step.flips += 1
         return readout.AGAIN
     if turned_enough:
@@ -438,10 +433,9 @@ def _write(c: ManyAreas, pace: Pace, s: LoopState, t: float) -> None:
         errors.charge_error(form, work, c.tables.lobes, h, step.theta, z, s.collected, s.control[0])
     for e in range(c.s_before.size):
         work.gained[e] = readout.at(values[first_z + e], work.modal.basis) if pace.charge else 0.0
-    if s.step[0].in_jump > 0 or not readout.is_wanted(s, step.t_new):
-        return
-    errors.write_columns(form.shape, form.follow, work.modal.w, work.s, s.y, pace.charge, values)
-    readout.write_step(s, t, work.modal)
+    if step.in_jump == 0:
+        errors.write_columns(form.shape, form.follow, work.modal.w, work.s, s.y, pace.charge, values)
+        readout.write_step(s, t, work.modal)
 
 
 @jit_within
@@ -479,7 +473,7 @@ def _move(c: ManyAreas, s: LoopState) -> None:
 @jit_within
 def _cross(c: ManyAreas, s: LoopState, a: int) -> None:
     """Change the branch of area a at a zero of its gap voltage, which ends a step."""
-    control, branch, t_new = s.control[0], branch_of(c, s), s.step[0].t_new
+    control, branch, t_new = s.control[0], c.branch, s.step[0].t_new
     c.sign[a] = -c.sign[a]
     branch[a, 0], branch[a, 1] = t_new, t_new - branch[a, 0]
     s.counters[readout.ZEROS] += 1

@@ -70,7 +70,7 @@ def begin(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
     model, t = c.system.model, control.t
     if not t < t_end:
         return readout.DONE
-    if counters[readout.RECORDED] >= s.steps.times.shape[0] > 0:
+    if counters[readout.RECORDED] >= s.steps.times.shape[0]:
         step.is_paused = 1
         return readout.PAUSED
     evaluated = counters[readout.NFEV] - step.evaluated
@@ -201,12 +201,12 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
     sums[0, 0], sums[0, 1], sums[0, 2] = between(c.tables.lobes, r[U])
     for k in range(n):
         lin = (gain[k] * off[0, n], gain[k] * off[1, n], gain[k] * off[2, n])
-        mode = exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
+        exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
         for p in range(4):
             sums[1, p] += gap[k] * off[p, k]
             sums[2, p] += gap[k] * places[k, p + 1]
-        for p in range(3):
-            places[k, p + 1] += mode[p]
+        for p in range(N_PLACES):
+            places[k, p] += x.brief[k, p]
     worst, magnified, run[0] = 0.0, 1.0, 0.0
     for p in range(4):
         row = readout.row_of(p + 1)
@@ -265,22 +265,17 @@ def _node_error(c: OneArea, level: int) -> float:
     Under `mobile` the voltages are the modes times 1/A: their error contains that of A, and the interpolation error of
     the product.
     """
-    system, r, w, places, lobes = c.system, c.work.r, c.work.modal.w, c.work.modal.places, c.tables.lobes
+    system, r, w, places, brief = c.system, c.work.r, c.work.modal.w, c.work.modal.places, c.work.modal.brief
     node, k_node, gap, area0 = system.node[level], system.k_node, system.gap[level], system.model.area0
     if not system.model.mobile:
         return exponential.node_error(node, k_node[:, np.newaxis], places, c.work.off)
     own, missed, values = np.zeros((places.shape[0], N_PLACES)), np.zeros(N_PLACES), np.zeros(ROWS)
     moved = np.zeros(N_PLACES)
     for p in range(N_PLACES):
-        for k in range(gap.size):
-            own[k, p] = area0 * r[Q, readout.row_of(p)] * places[k, p]
-    for k in range(gap.size):
-        missed[1], missed[2], missed[3] = between(lobes, w[k])
-        for p in range(N_PLACES):
-            own[k, p] -= area0 * r[Q, readout.row_of(p)] * missed[p]
-            moved[p] += gap[k] * own[k, p]
-    for p in range(N_PLACES):
         row = readout.row_of(p)
+        for k in range(gap.size):
+            own[k, p] = area0 * r[Q, row] * places[k, p] - area0 * r[Q, row] * brief[k, p]
+            moved[p] += gap[k] * own[k, p]
         moved[p] *= area0 * r[DQ, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
     worst = 0.0
     for i in range(k_node.size):
@@ -290,7 +285,7 @@ def _node_error(c: OneArea, level: int) -> float:
                 values[j] += node[i, k] * w[k, j]
             values[j] *= area0 * r[Q, j]
             values[j] += k_node[i] * r[SOURCE, j]
-        missed[1], missed[2], missed[3] = between(lobes, values)
+        missed[1], missed[2], missed[3] = between(c.tables.lobes, values)
         for p in range(N_PLACES):
             total = missed[p]
             for k in range(gap.size):
@@ -342,8 +337,6 @@ def _write(c: OneArea, pace: Pace, s: LoopState, t: float) -> None:
     n_shown = shown.shape[0]
     if pace.charge:
         charge_step(c, s, values[n_shown], values[n_shown + 1])
-    if not readout.is_wanted(s, step.t_new):
-        return
     readout.layers(model.mobile, model.area0, system.k_shown, shown, x.w, r[SOURCE], r[Q], values)
     readout.write_step(s, t, x)
 
