@@ -1,4 +1,5 @@
-"""Collocation at Gauss-Lobatto points against an exact exponential: nodes, bases and tables, compiled.
+"""Collocation at Gauss-Lobatto points against an exact exponential: nodes, bases and tables, compiled; and Radau IIA of
+any number of stages (Hairer and Wanner, Solving Ordinary Differential Equations II, 1996, IV.5).
 
 On a step of length h a mode w' = -rate w + g(t) has, with g interpolated at the nodes, the exact solution
 
@@ -14,12 +15,14 @@ The sizes are constants, so that the compiler unrolls every inner loop.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from fractions import Fraction
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.compiled import jit, jit_fused, jit_rows
 
 NODES = 13
@@ -179,12 +182,69 @@ def fill_table(z: float, decay: FloatArray, phi: FloatArray, miss: FloatArray) -
         _fill_late(z, decay, phi, miss)
 
 
-@lru_cache(maxsize=1)
+@cache
 def integral_table() -> FloatArray:
     """`phi` of a mode with rate zero: integrals over [0, c_i] of the interpolant, shape (NODES, ROWS)."""
     phi = np.empty((NODES, ROWS))
     fill_table(0.0, np.empty(ROWS), phi, np.empty(ROWS))
     return phi
+
+
+class Scheme(NamedTuple):
+    """Radau IIA of s stages as numbers: order 2 s - 1 at the end of a step, stiffly accurate, L-stable."""
+
+    a: FloatArray  # (s, s): Stage weights; the last row gives the end of the step
+    c: FloatArray  # (s,): Stage times in units of the step, the last one 1
+    # (s,): Error weights: the highest Legendre coefficient of the increment, the part that a polynomial of one degree
+    # less could not follow
+    e: FloatArray
+    dense: FloatArray  # (s, s): x(t + theta h) = x + h sum_i sum_j K_i dense[i, j] theta^(j + 1), of order s
+    eigenvalues: ComplexArray  # (m,): Of `a`: one of each conjugate pair, and the real one
+    # to, back (m, s): a = Re(back diag(eigenvalues) to), so that each eigenvalue needs a linear system of n only
+    to: ComplexArray
+    back: ComplexArray
+    h_max: float  # s
+
+
+@cache
+def radau_scheme(stages: int) -> Scheme:
+    """Radau IIA with `stages` nodes."""
+    s = stages
+    # Nodes: roots of P_s - P_{s-1} mapped to (0, 1]; the last is 1.
+    coefficients = np.zeros(s + 1)
+    coefficients[s - 1 :] = -1.0, 1.0
+    roots = np.sort(legendre.legroots(coefficients).real)
+    for _ in range(3):
+        roots -= legendre.legval(roots, coefficients) / legendre.legval(roots, legendre.legder(coefficients))
+    c = 0.5 * (roots + 1.0)
+    c[-1] = 1.0
+    # The derivative is the interpolant of the stages; its integral is the dense output. In fractions: the coefficients
+    # of the interpolant cancel over many digits, and rounding would leave 3e-13 of a step of seven stages.
+    at = [Fraction(float(x)) for x in c]
+    dense = [[x / (d + 1) for d, x in enumerate(_cardinal(at, i))] for i in range(s)]
+    a = np.array([[sum(x * t ** (d + 1) for d, x in enumerate(row)) for row in dense] for t in at], float)
+    # The highest coefficient of the shifted Legendre polynomial of degree s is (2 s)! / s!^2.
+    e = [row[-1] / math.comb(2 * s, s) for row in dense]
+    values, vectors = np.linalg.eig(a)
+    back = np.linalg.inv(vectors)
+    upper = np.flatnonzero(values.imag > -1e-12)
+    # Of a conjugate pair keep one eigenvalue: the pair's contribution is twice its real part.
+    twice = np.where(values.imag[upper] > 1e-12, 2.0, 1.0)
+    return Scheme(
+        a, c, np.array(e, float), np.array(dense, float), values[upper].astype(complex),
+        np.ascontiguousarray(back[upper].astype(complex)),
+        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
+    )  # fmt: skip
+
+
+def _cardinal(at: list[Fraction], i: int) -> list[Fraction]:
+    """Coefficients of 1, theta, ... of the polynomial that is 1 at one of the nodes and 0 at the others."""
+    out = [Fraction(1)]
+    for j, t in enumerate(at):
+        if j != i:
+            higher, lower = [Fraction(0), *out], [*out, Fraction(0)]
+            out = [(x - t * y) / (at[i] - t) for x, y in zip(higher, lower, strict=True)]
+    return out
 
 
 @jit_rows

@@ -429,7 +429,6 @@ STEP = np.dtype([
     ("most", np.int64),  # Steps allowed
     ("unconverged", np.int64),  # Iterations of this call
     ("accepted_before", np.int64),  # Steps, before this call
-    ("pause_at", np.int64),  # So many accepted steps
     # Of a network
     ("has_begun", np.int64),  # Whether the call has
     ("in_jump", np.int64),  # Whether it is within a jump of the sources

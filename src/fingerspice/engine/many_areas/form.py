@@ -238,16 +238,19 @@ def _subtract(area: FloatArray, area0: float, more: FloatArray) -> None:
 
 
 @jit_within
-def _evaluate(
-    c: Any, s: Any, w: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
-    least: FloatArray,
-) -> bool:  # fmt: skip
-    """Forcing of the modes by the areas, into `pull` (m, ROWS), from the modes w (m, ROWS).
+def evaluate_many(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool) -> bool:
+    """Forcing of the modes w by the areas into `pull` (m, ROWS), and what goes with it: rows of the step at hand.
 
-    `d` receives the derivatives of stiff modes. `cells` and `areas` are blocks of rows, whose parts that follow the
-    sources are given. False beyond a fold; under `mobile`, `least` (ROWS,) receives the distance to it.
+    `probing` is for other modes than those of the step, whose own rows stay as they are. False beyond a fold.
     """
     form, work, sign, h, several = form_of(c, s), c.work, c.sign, s.step[0].length, s.step[0].several > 0
+    # Derivatives of stiff modes, blocks of rows, and the distance to the fold.
+    d, cells, areas, least = work.d, work.cells, work.areas, work.room[3]
+    if probing:
+        d, cells, areas, least = work.modal.spare[5], work.spare_cells, work.spare_areas, work.room[1]
+        for part in (ETA_S, CHI_S, RHO):
+            copy_to(cells[part], work.cells[part])
+        copy_to(areas[U_S], work.areas[U_S])
     coupling, lin, rates, mobile = work.own, work.lin, form.rates, form.mobile
     n = form.gap.shape[1]
     stiff = coupling.key[1] > 0
@@ -320,7 +323,7 @@ def answer_mobile(
 
 @jit_within
 def follow_sources(form: Form, work: Work) -> None:
-    """The parts of a step's rows that depend on the sources alone; see `_evaluate`."""
+    """The parts of a step's rows that depend on the sources alone; see `evaluate_many`."""
     coupling, s, ds, lin, cells, areas = work.own, work.s, work.ds, work.lin, work.cells, work.areas
     n = form.gap.shape[1]
     multiply(form.gain, s, None, lin)
@@ -329,23 +332,6 @@ def follow_sources(form: Form, work: Work) -> None:
     combine(coupling.from_sources, s, 0, cells[ETA_S])
     multiply(coupling.from_slopes, s, None, cells[CHI_S])
     multiply(form.gap_s, s, None, areas[U_S])
-
-
-@jit_within
-def evaluate_many(c: Any, s: Any) -> bool:
-    """The forcing at the modes of the step at hand."""
-    work = c.work
-    return _evaluate(c, s, work.modal.w, work.d, work.modal.pull, work.cells, work.areas, work.room[3])
-
-
-@jit_within
-def probe_many(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
-    """The forcing at other modes w than those of the step at hand, whose own rows stay as they are."""
-    work, cells, areas = c.work, c.work.spare_cells, c.work.spare_areas
-    for part in (ETA_S, CHI_S, RHO):
-        copy_to(cells[part], work.cells[part])
-    copy_to(areas[U_S], work.areas[U_S])
-    return _evaluate(c, s, w, work.modal.spare[5], pull, cells, areas, work.room[1])
 
 
 @jit

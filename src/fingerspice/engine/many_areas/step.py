@@ -78,8 +78,6 @@ def start_at(area0: FloatArray, area: FloatArray) -> None:
 
 # Relative change of a source at an edge that counts as rounding error, not as a jump.
 _ROUNDING, _UNNOTICED = 1e-14, 1e-9
-# Number of modes times steps between two pauses, in which Python can react to Ctrl-C.
-_AT_ONCE = 40_000
 
 
 class ManyAreas(NamedTuple):
@@ -107,16 +105,10 @@ class ManyAreas(NamedTuple):
 
 @jit
 def start(c: ManyAreas, s: LoopState) -> None:
-    """Begin a call of the loop, or go on after a pause, which changes nothing."""
+    """Begin a window of the sources."""
     form, work, step, counters = c.form, c.work, s.step[0], s.counters
     n = form.shape.shape[0]
-    step.pause_at = counters[readout.ACCEPTED] + 1 + _AT_ONCE // form.rates.size
-    # Other runs may have used the tables since the last call.
-    s.step[0].tabled = 0.0
-    if step.is_paused > 0:
-        step.is_paused = 0
-        return
-    step.flips, step.fresh = 0, step_control.NOT_FRESH
+    step.fresh = step_control.NOT_FRESH
     step.in_jump, step.has_begun, step.unconverged = 0, 0, 0
     step.accepted_before = counters[readout.ACCEPTED]
     step.several = 0
@@ -134,20 +126,15 @@ def start(c: ManyAreas, s: LoopState) -> None:
 @jit
 def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
     """Where the next step starts: at an edge of a source, within a jump, or later; and its length."""
-    form, work, step, control, counters = c.form, c.work, s.step[0], s.control[0], s.counters
+    form, work, step, control = c.form, c.work, s.step[0], s.control[0]
     if step.in_jump > 0 and control.t >= 1.0:
         _leave_jump(c, s)
-    if counters[readout.ACCEPTED] + counters[readout.REJECTED] > step.most:
-        return readout.TOO_MANY
     step.stop, step.at_edge = 1.0, 0
     if step.in_jump > 0:
         copy_to(work.now, c.s_before)
     else:
         if step.has_begun > 0 and control.t >= t_end:
             return readout.DONE
-        if counters[readout.ACCEPTED] >= step.pause_at or counters[readout.RECORDED] >= s.steps.times.shape[0]:
-            step.is_paused = 1
-            return readout.PAUSED
         _look_at_sources(c, s, t_end)
         if step.in_jump == 0 and control.t >= t_end:
             return readout.DONE

@@ -197,15 +197,18 @@ def _push(push: FloatArray, q0: float, area0: float, source: FloatArray, q: Floa
 
 
 @jit_within
-def _evaluate(c: Any, s: Any, w: FloatArray, r: FloatArray, pull: FloatArray) -> bool:
-    """Gap voltage, 1/A and nonlinear term, into `r` and `pull`, from the modes w, all as in `Work`.
+def evaluate_one(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool) -> bool:
+    """The nonlinear term at the modes w into `pull`, and with it gap voltage and 1/A: rows of the step at hand.
 
-    Under `mobile`, r[GUESS] holds a guess of the gap voltage; False where the area equation was not solved on the
-    branch connected to it.
+    `probing` is for other modes than those of the step, whose own rows stay as they are. False where, under `mobile`,
+    the area equation was not solved on the branch connected to the guess of the gap voltage.
     """
     system, level, sign, tapped = c.system, s.step[0].level, s.control[0].sign, c.work.tapped
-    model = system.model
+    model, r = system.model, c.work.spare_r if probing else c.work.r
     mobile, q0 = model.mobile, system.q0[level]
+    if probing:
+        copy_to(r[SOURCE], c.work.r[SOURCE])
+        copy_to(r[GUESS], c.work.r[U])
     multiply(system.gap[level : level + 1], w, None, r[X_GAP : X_GAP + 1])
     _gap_voltage(model.k_gap, r[SOURCE], r[X_GAP], r[U])
     if mobile:
@@ -219,21 +222,6 @@ def _evaluate(c: Any, s: Any, w: FloatArray, r: FloatArray, pull: FloatArray) ->
     if mobile:
         _push(system.push[level], q0, model.area0, r[SOURCE], r[Q], pull)
     return True
-
-
-@jit_within
-def evaluate_one(c: Any, s: Any) -> bool:
-    """The nonlinear term at the modes of the step at hand."""
-    return _evaluate(c, s, c.work.modal.w, c.work.r, c.work.modal.pull)
-
-
-@jit_within
-def probe_one(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
-    """The nonlinear term at other modes w than those of the step at hand, whose own rows stay as they are."""
-    work = c.work
-    copy_to(work.spare_r[SOURCE], work.r[SOURCE])
-    copy_to(work.spare_r[GUESS], work.r[U])
-    return _evaluate(c, s, w, work.spare_r, pull)
 
 
 @jit

@@ -48,13 +48,8 @@ class OneArea(NamedTuple):
 
 @jit_within
 def start(c: OneArea, s: LoopState) -> None:
-    """Begin a call of the loop: find the segment of the source, unless the run was paused."""
+    """Begin a window of the source: find the segment."""
     step, control, counters = s.step[0], s.control[0], s.counters
-    # Other runs may have used the tables since the last call.
-    step.tabled, step.level, step.flips = 0.0, -1, 0
-    if step.is_paused > 0:
-        step.is_paused = 0
-        return
     edges = c.sources.edges
     step.index = segment_at(edges, control.t) - 1 if edges[0] < control.t else -1
     # The segment is entered at the first step, as its edge is not before the present time.
@@ -70,12 +65,7 @@ def begin(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
     model, t = c.system.model, control.t
     if not t < t_end:
         return readout.DONE
-    if counters[readout.RECORDED] >= s.steps.times.shape[0]:
-        step.is_paused = 1
-        return readout.PAUSED
     evaluated = counters[readout.NFEV] - step.evaluated
-    if counters[readout.ACCEPTED] + counters[readout.REJECTED] > step.most:
-        return readout.TOO_MANY
     if evaluated > NODES * readout.FIRST_PASSES:
         longest = (t - step.begun) / pace.h_max
         if evaluated > NODES * (readout.FIRST_PASSES + readout.MOST_PASSES * longest):
