@@ -367,17 +367,6 @@ def _account(c: Nodal, t: float, h: float) -> None:
 
 
 @jit
-def _next_edge(c: Nodal, t: float, t_end: float) -> float:
-    """The next edge of a source after t, or `t_end` (s); the segments at t go into `work.place`."""
-    sources, place, stop = c.sources, c.work.place, t_end
-    for i in range(place.size):
-        while sources.edges[sources.first[i] + place[i] + 1] <= t:
-            place[i] += 1
-        stop = min(stop, sources.edges[sources.first[i] + place[i] + 1])
-    return stop
-
-
-@jit
 def _prepare(c: Nodal, now: FloatArray, slopes: FloatArray) -> bool:
     """Derivative of the state, into `work.rate`, and of the residual, where the sources are `now`; False at a fold."""
     copy_to(c.room.s, now)
@@ -455,7 +444,7 @@ def advance(c: Nodal, t_end: float) -> int:
     pause = counters[ACCEPTED] + counters[REJECTED] + STEPS_AT_ONCE
     while control[BASE] + control[T] < t_end:
         base, t = control[BASE], control[T]
-        stop = _next_edge(c, base + t, t_end)
+        stop = network.next_edge(c.sources, work.place, base + t, t_end)
         room_left = (stop - base) - t
         network.at_sources(c.sources, work.place, base, t, now, slopes)
         if not c.jump:

@@ -59,8 +59,7 @@ MOST_STEPS = 200_000
 # faster there.
 FIRST_PASSES, MOST_PASSES = 20_000, 2_000
 # Outputs are evaluated in groups as wide as the processor's vectors, and searched in strides.
-WRITTEN_AT_ONCE = _GROUP = 8
-_STRIDE = 32
+_GROUP, _STRIDE = 8, 32
 
 
 class Steps(NamedTuple):
@@ -121,7 +120,6 @@ class Modal(NamedTuple):
     # values, coefficients (n_column, ROWS): Output columns and their Chebyshev coefficients
     values: FloatArray
     coefficients: FloatArray
-    outputs: FloatArray  # (2, WRITTEN_AT_ONCE): Scratch
     basis: FloatArray  # (NODES,): See `readout.basis_at`
     # u, guess (n_area, ROWS): Gap voltages now and an iteration before, V
     u: FloatArray
@@ -133,7 +131,7 @@ def new_modal(m: int, columns: int, u: FloatArray, guess: FloatArray) -> Modal:
     rows, wide = (m, ROWS), (columns, ROWS)
     shapes = (
         rows, rows, rows, rows, rows, rows, (6, m, ROWS), (m,), (m,), (m, N_PLACES), (m, N_PLACES),
-        (m, N_PLACES - 1), (len(u), N_PLACES), wide, wide, (2, WRITTEN_AT_ONCE), (NODES,),
+        (m, N_PLACES - 1), (len(u), N_PLACES), wide, wide, (NODES,),
     )  # fmt: skip
     return Modal._make((*aligned(shapes), u, guess))
 
@@ -258,26 +256,27 @@ def _outputs_within(first: int, guess: int, low: float, high: float, t_out: Floa
 
 @jit
 def write_outputs(
-    t: float, h: float, reached: float, t_new: float, slack: float, powers: bool, series: FloatArray, work: FloatArray,
-    first: int, guess: int, outputs: Outputs,
+    t: float, h: float, reached: float, t_new: float, slack: float, powers: bool, series: FloatArray, first: int,
+    guess: int, outputs: Outputs,
 ) -> int:  # fmt: skip
     """Outputs of one step from number `first` on: right-hand ones in [t, t_new), left-hand ones in (t, t_new].
 
     With `powers` the series holds the coefficients of 1, x, x^2, ... instead. Times within `slack` of t_new are t_new;
     `guess` is the expected number. Places after the last output are overwritten: they belong to later steps.
-    `work` has shape (2, WRITTEN_AT_ONCE). Returns how many there were.
+    Returns how many there were.
     """
     t_out, out = outputs.t, outputs.columns
     count = _outputs_within(first, guess, t_new - slack, t_new + slack, t_out, outputs.left)
     groups = (count + _GROUP - 1) // _GROUP
     scale = 2.0 / h
     top = 2.0 * reached - 1.0
-    # The last group of a run may be too wide for the array: it is written through `work`.
+    # The last group of a run may be too wide for the array: it is written through another.
     whole = groups if first + _GROUP * groups <= t_out.size else groups - 1
     rest = first + _GROUP * whole
     for column in range(out.shape[0]):
         _values_at(series[column], powers, t_out[first:], t, scale, top, whole, out[column, first:])
         if whole < groups:
+            work = np.empty((2, _GROUP))
             for i in range(_GROUP):
                 work[0, i] = t_out[min(rest + i, t_out.size - 1)]
             _values_at(series[column], powers, work[0], t, scale, top, 1, work[1])
@@ -350,7 +349,6 @@ def _repeat(
     held, as_powers = borrow(held), borrow(as_powers)
     if begin == 1:
         _make_series(series, as_powers)
-    work = np.zeros((2, WRITTEN_AT_ONCE))
     for k in range(begin, end):
         shift = k * period
         before = first
@@ -365,8 +363,7 @@ def _repeat(
             reached = (times[i, 2] - times[i, 0]) / h
             # Mostly a period has as many outputs as the one before.
             held[i] = write_outputs(
-                times[i, 0] + shift, h, min(reached, 1.0), stop, slack, as_powers[i], series[i], work, first, held[i],
-                outputs,
+                times[i, 0] + shift, h, min(reached, 1.0), stop, slack, as_powers[i], series[i], first, held[i], outputs
             )  # fmt: skip
             first += held[i]
         for c in range(out.shape[0]):
@@ -500,5 +497,5 @@ def write_step(s: LoopState, t: float, x: Modal) -> None:
         for c in range(s.outputs.columns.shape[0]):
             series_of(values[c], coefficients[c])
         counters[OUTPUT] += write_outputs(
-            t, step.length, step.theta, step.t_new, 0.0, False, coefficients, x.outputs, first, 0, s.outputs
+            t, step.length, step.theta, step.t_new, 0.0, False, coefficients, first, 0, s.outputs
         )  # fmt: skip

@@ -26,7 +26,7 @@ from fingerspice.engine.collocation.readout import CONTROL, N_PLACES, Modal, new
 from fingerspice.engine.many_areas import coupling as couplings
 from fingerspice.engine.network import Sources
 from fingerspice.engine.one_area import rows as stack_rows
-from fingerspice.engine.one_area.rows import area_rows
+from fingerspice.engine.one_area.rows import area_rows, largest_size
 from fingerspice.numerics.lobatto import NODES, POINTS, ROWS, TO_SLOPES, combine, multiply
 from fingerspice.numerics.modes import copy_to
 
@@ -190,14 +190,6 @@ def clear(rows: FloatArray) -> None:
 
 
 @jit_rows
-def _highest(sign: float, u: FloatArray) -> float:
-    highest = 0.0
-    for i in range(ROWS):
-        highest = max(highest, sign * u[i])
-    return highest
-
-
-@jit_rows
 def _inverted(q: FloatArray, dq: FloatArray, slopes_too: bool) -> None:
     """The area and, if wanted, its slope in place of 1/A and the slope of that."""
     for i in range(ROWS):
@@ -211,7 +203,7 @@ def _inverted(q: FloatArray, dq: FloatArray, slopes_too: bool) -> None:
 def wanted(form: Form, a: int, slopes_too: bool, sign: float, areas: FloatArray) -> None:
     """Area a at its gap voltages on the branch of a sign and, if wanted, its derivative by them."""
     curve, u, area, slope = form.curves[a], areas[U, a], areas[AREA, a], areas[SLOPE, a]
-    scale = form.scale[a] if _highest(sign, u) <= curve[1] else 0.0
+    scale = form.scale[a] if largest_size(u) <= curve[1] else 0.0
     area_rows(form.powers[a], form.slopes[a], form.lo[a], scale, curve, u, sign, slopes_too, area, slope)
     _inverted(area, slope, slopes_too)
 
@@ -332,6 +324,10 @@ def follow_sources(form: Form, work: Work) -> None:
     combine(coupling.from_sources, s, 0, cells[ETA_S])
     multiply(coupling.from_slopes, s, None, cells[CHI_S])
     multiply(form.gap_s, s, None, areas[U_S])
+    # Areas that do not follow a voltage stay as at the reference.
+    for a in range(form.area0.size):
+        for i in range(ROWS):
+            areas[AREA, a, i] = form.area0[a]
 
 
 @jit
