@@ -164,7 +164,7 @@ def _stage(c: Nodal, i: int, h: float) -> None:
 
 @jit
 def _residuals(c: Nodal, h: float) -> None:
-    """Weighted residuals of all stages into `work.residual`, and the charges' rates into `work.k`; counted."""
+    """Weighted residuals of all stages into `work.residual`, and the charges' rates into `work.k`."""
     net, room, work, jump, sign = c.net, c.room, c.work, c.jump, c.sign
     stages, m = work.residual.shape
     for i in range(stages):

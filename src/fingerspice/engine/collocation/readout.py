@@ -377,7 +377,7 @@ def _repeat(
 def _make_series(values: FloatArray, as_powers: NDArray[np.bool_]) -> None:
     """Turn values at the nodes (n_step, n_column, NODES) into coefficients of 1, x, x^2, ..., which halve the work.
 
-    Of steps where these are less exact, which `as_powers` (n_step,) does not mark, into those of Chebyshev series.
+    Where these are less exact they become those of Chebyshev series; `as_powers` (n_step,) marks the other steps.
     """
     series = np.zeros((values.shape[1], ROWS))
     for i in range(as_powers.size):
@@ -475,7 +475,7 @@ def may_shorten(s: LoopState, since: float) -> bool:
 
 @jit
 def _take(steps: Steps, place: int, s: LoopState, t: float, values: FloatArray) -> None:
-    """Put a finished step that began at t (s) in a place."""
+    """Put a finished step that began at t (s), with its output columns (n_column, ROWS), into a place of `steps`."""
     times, nodes, step = steps.times, steps.values, s.step[0]
     times[place, 0], times[place, 1], times[place, 2], times[place, 3] = t, step.length, step.t_new, step.theta
     for c in range(nodes.shape[1]):

@@ -231,9 +231,10 @@ def _subtract(area: FloatArray, area0: float, more: FloatArray) -> None:
 
 @jit_within
 def evaluate_many(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool) -> bool:
-    """Forcing of the modes w by the areas into `pull` (m, ROWS), and what goes with it: rows of the step at hand.
+    """Write the forcing of the modes w by the areas into `pull` (m, ROWS), and what it comes from into rows of `Work`.
 
-    `probing` is for other modes than those of the step, whose own rows stay as they are. False beyond a fold.
+    With `probing`, the modes are not those of the step at hand, and other rows are taken, so that those of the step
+    stay as they are. False beyond a fold.
     """
     form, work, sign, h, several = form_of(c, s), c.work, c.sign, s.step[0].length, s.step[0].several > 0
     # Derivatives of stiff modes, blocks of rows, and the distance to the fold.

@@ -395,7 +395,7 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
 
 @jit_within
 def _finish(c: ManyAreas, charge: bool, s: LoopState, t: float) -> None:
-    """Charges of a step that began at t (s or, in a jump, a fraction), its outputs, peaks and errors, and its end."""
+    """Charges, outputs, peaks and errors of a step that began at t (s, or a fraction of a jump), and its end."""
     form, work, step, x, values = forms.form_of(c, s), c.work, s.step[0], c.work.modal, c.work.modal.values
     n_y, n_s, theta, before, jump = s.y.size, c.s_before.size, step.theta, c.s_before, work.jump
     readout.basis_at(theta, x.basis)

@@ -198,10 +198,11 @@ def _push(push: FloatArray, q0: float, area0: float, source: FloatArray, q: Floa
 
 @jit_within
 def evaluate_one(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool) -> bool:
-    """The nonlinear term at the modes w into `pull`, and with it gap voltage and 1/A: rows of the step at hand.
+    """Write the nonlinear term at the modes w into `pull`, and the gap voltage and 1/A into the rows of `Work.r`.
 
-    `probing` is for other modes than those of the step, whose own rows stay as they are. False where, under `mobile`,
-    the area equation was not solved on the branch connected to the guess of the gap voltage.
+    With `probing`, the modes are not those of the step at hand, and other rows are taken, so that those of the step
+    stay as they are. False where, under `mobile`, the area equation was not solved on the branch connected to the guess
+    of the gap voltage.
     """
     system, level, sign, tapped = c.system, s.step[0].level, s.control[0].sign, c.work.tapped
     model, r = system.model, c.work.spare_r if probing else c.work.r

@@ -315,7 +315,7 @@ def complete(c: OneArea, pace: Pace, s: LoopState) -> int:
 
 @jit_within
 def _finish(c: OneArea, charge: bool, s: LoopState, t: float) -> None:
-    """Charge of a step that began at t (s), its outputs, peaks and errors, and its end, or where it is cut short."""
+    """Charge, outputs, peaks and errors of a step that began at t (s), and the state at its end or where it is cut."""
     system, r, step, control, x, y = c.system, c.work.r, s.step[0], s.control[0], c.work.modal, s.y
     model, shown, values, theta = system.model, system.shown[step.level], x.values, step.theta
     n_shown = shown.shape[0]
