@@ -159,12 +159,13 @@ def engine_account(
         places = np.zeros((2, N_PLACES))
         places[:, 1 : N_PLACES - 1] = missed
     work = rows.new_stack_work(2)
+    work.modal.brief[:, 1 : N_PLACES - 1] = 0.0 if missed is None else missed
     r, work.modal.w[:], work.modal.places[:] = work.r, w, places
     r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
     r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
     control, collected = np.zeros(1, readout.CONTROL)[0], np.array([[before], [0.0]])
     control["last_q"] = 1.0 / last_area
-    charge._account(step.model, step.gap, step.slow, work, LOBES, H, 1.0, 0.0, kept, control, collected)
+    charge._account(step.model, step.gap, step.slow, work, H, 1.0, 0.0, kept, control, collected)
     return float(collected[0, 0]), float(control["error_q"])
 
 

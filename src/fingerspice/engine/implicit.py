@@ -6,17 +6,16 @@ A step is solved by simplified Newton iterations in the eigenvectors of the tabl
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import ComplexArray, FloatArray, IntArray, read_only
+from fingerspice.base.arrays import ComplexArray, FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine import network
-from fingerspice.engine.collocation.readout import TRIED, note
-from fingerspice.numerics.lobatto import radau
+from fingerspice.engine.collocation.readout import note
+from fingerspice.numerics.lobatto import Scheme
 from fingerspice.numerics.modes import copy_to, invert
 
 # Entry of `counters`: evaluations of the right-hand side.
@@ -25,37 +24,6 @@ NFEV = 0
 CONVERGED = 0.01
 # Length over which a step's polynomial is extrapolated for a guess of the next step, over the step's own length.
 FARTHEST = 2.0
-
-
-class Scheme(NamedTuple):
-    """Radau IIA as numbers (see `fingerspice.numerics.lobatto.Tableau`), with its matrix diagonalised."""
-
-    # a, c, e, dense: The tableau's; `e` (s,) gives the highest Legendre coefficient of the increment
-    a: FloatArray
-    c: FloatArray
-    e: FloatArray
-    dense: FloatArray
-    eigenvalues: ComplexArray  # (m,): Of `a`: one of each conjugate pair, and the real one
-    # to, back (m, s): a = Re(back diag(eigenvalues) to)
-    to: ComplexArray
-    back: ComplexArray
-    h_max: float  # s
-
-
-@cache
-def radau_scheme(stages: int) -> Scheme:
-    """The Radau IIA method with its matrix diagonalised, so that each eigenvalue needs a linear system of n only."""
-    tableau = radau(stages)
-    values, vectors = np.linalg.eig(tableau.a)
-    back = np.linalg.inv(vectors)
-    upper = np.flatnonzero(values.imag > -1e-12)
-    # Of a conjugate pair keep one eigenvalue: the pair's contribution is twice its real part.
-    twice = np.where(values.imag[upper] > 1e-12, 2.0, 1.0)
-    return Scheme(
-        tableau.a, tableau.c, tableau.e, np.ascontiguousarray(tableau.dense), values[upper].astype(complex),
-        np.ascontiguousarray(back[upper].astype(complex)),
-        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
-    )  # fmt: skip
 
 
 class Work(NamedTuple):
@@ -68,18 +36,16 @@ class Work(NamedTuple):
     weight: FloatArray
     newton: ComplexArray
     rate: FloatArray
-    start: FloatArray
     stage: FloatArray
     y1: FloatArray
     residual: FloatArray
     place: IntArray
-    base: FloatArray
     s: FloatArray
     ds: FloatArray
 
 
 class Nodal(NamedTuple):
-    """A network and its sources, as the implicit steps take them; `room` and `work` are scratch arrays."""
+    """An integration of a network by implicit steps in progress; `room` and `work` are scratch arrays."""
 
     net: network.Net
     room: network.Room
@@ -87,9 +53,26 @@ class Nodal(NamedTuple):
     work: Work
     sources: network.Sources
     jump: bool  # Whether the sources' "time" is the fraction of a jump
-    sign: FloatArray  # (n_area,): Branch of each area; 0: to be chosen
     scale: FloatArray  # (size,): Size of each entry of the state, to which its error is relative
     tol: float  # Error allowed in a step, as a fraction of `scale`
+    # y, s_before, sign: State, the sources' values just before the time reached, and the branch of each area (0: to be
+    # chosen); updated
+    y: FloatArray
+    s_before: FloatArray
+    sign: FloatArray
+    # control, counters, peaks: Bookkeeping, updated; peaks (n_area,) in V
+    control: FloatArray
+    counters: IntArray
+    peaks: FloatArray
+    # (n, 4): Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one, number
+    # from 1
+    tried: FloatArray
+    charge: bool  # Whether the output rows contain the sources' currents
+    # t_out, left, rows: Output times (s, ascending), whether the left-hand limit is meant, and the rows to fill: the
+    # state, then the currents
+    t_out: FloatArray
+    left: NDArray[np.bool_]
+    rows: FloatArray
 
 
 @jit
@@ -99,19 +82,19 @@ def new_work(net: network.Net, stages: int, n_eigen: int, size: int) -> Work:
     m = size - n_s
     return Work(
         np.zeros((stages, size)), np.zeros((size, stages)), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m),
-        np.zeros((n_eigen, m, m), np.complex128), np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size),
-        np.zeros((stages, m)), np.zeros(n_s, np.int64), np.zeros(1), np.zeros((stages, n_s)), np.zeros((stages, n_s)),
+        np.zeros((n_eigen, m, m), np.complex128), np.zeros(size), np.zeros(size), np.zeros(size),
+        np.zeros((stages, m)), np.zeros(n_s, np.int64), np.zeros((stages, n_s)), np.zeros((stages, n_s)),
     )  # fmt: skip
 
 
 @jit
-def linearise(c: Nodal, y: FloatArray) -> None:
+def linearise(c: Nodal) -> None:
     """Derivatives of the residual by the state (by differences) and by its time derivative, at `work.rate`.
 
     Only for the part of the state on which the residual depends; each row is divided by its largest capacitance,
     because currents are tiny beside the derivatives of areas. The sources are those in `room`.
     """
-    net, room, work, jump, sign, scale = c.net, c.room, c.work, c.jump, c.sign, c.scale
+    net, room, work, jump, sign, scale, y = c.net, c.room, c.work, c.jump, c.sign, c.scale, c.y
     n = net.k.shape[0]
     m = work.slope.shape[0]
     network.capacitances(net, room, y, sign)
@@ -167,8 +150,11 @@ def _solve_newton(scheme: Scheme, work: Work) -> None:
 
 
 @jit
-def _stage(scheme: Scheme, work: Work, i: int, h: float, y: FloatArray) -> None:
-    """State at a stage of the step that starts at `y`, into `work.stage`."""
+def _stage(c: Nodal, i: int, h: float) -> None:
+    """State at a stage of a step, into `work.stage`, and the sources there."""
+    scheme, work, y = c.scheme, c.work, c.y
+    copy_to(c.room.s, work.s[i])
+    copy_to(c.room.ds, work.ds[i])
     for j in range(y.size):
         value = 0.0
         for r in range(scheme.c.size):
@@ -177,41 +163,37 @@ def _stage(scheme: Scheme, work: Work, i: int, h: float, y: FloatArray) -> None:
 
 
 @jit
-def _residuals(c: Nodal, h: float, y: FloatArray) -> None:
+def _residuals(c: Nodal, h: float) -> None:
     """Weighted residuals of all stages into `work.residual`, and the charges' rates into `work.k`."""
-    net, room, scheme, work, jump, sign = c.net, c.room, c.scheme, c.work, c.jump, c.sign
+    net, room, work, jump, sign = c.net, c.room, c.work, c.jump, c.sign
     stages, m = work.residual.shape
     for i in range(stages):
-        _stage(scheme, work, i, h, y)
-        copy_to(room.s, work.s[i])
-        copy_to(room.ds, work.ds[i])
+        _stage(c, i, h)
         network.residual(net, room, jump, work.stage, sign, work.k[i], room.base)
         for j in range(m):
             work.residual[i, j] = work.weight[j] * room.base[j]
         # Nothing depends on the charges: they are only integrated.
-        for j in range(m, y.size):
+        for j in range(m, room.base.size):
             work.k[i, j] = room.base[j]
+    c.counters[NFEV] += stages
 
 
 @jit
-def step(c: Nodal, t: float, h: float, y: FloatArray, counters: IntArray) -> float:
+def step(c: Nodal, t: float, h: float) -> float:
     """Collocation over [t, t + h] with `work.slope` as Newton's matrix: stages in `work.k`, the end in `work.y1`.
 
     `work.k` holds a guess of the stages. Returns the error over `tol` times `scale`; inf where it does not converge.
     """
-    net, room, scheme, work, jump, sign, scale, tol = (
-        c.net, c.room, c.scheme, c.work, c.jump, c.sign, c.scale, c.tol
-    )  # fmt: skip
+    scheme, work, scale, tol, y = c.scheme, c.work, c.scale, c.tol, c.y
     stages, m = work.residual.shape
     if not _prepare_newton(scheme, work, h):
         return math.inf
     k = work.k
     for i in range(stages):
-        network.at_sources(c.sources, work.place, work.base[0], t + scheme.c[i] * h, work.s[i], work.ds[i])
+        network.at_sources(c.sources, work.place, c.control[BASE], t + scheme.c[i] * h, work.s[i], work.ds[i])
     before = math.inf
     for iteration in range(12):
-        _residuals(c, h, y)
-        counters[NFEV] += stages
+        _residuals(c, h)
         _solve_newton(scheme, work)
         change = 0.0
         for i in range(stages):
@@ -232,8 +214,7 @@ def step(c: Nodal, t: float, h: float, y: FloatArray, counters: IntArray) -> flo
         return math.inf
     if y.size > m and scale[m] < math.inf:
         # The charges' derivatives belong to the last iteration but one: evaluate them again if charges are wanted.
-        _residuals(c, h, y)
-        counters[NFEV] += stages
+        _residuals(c, h)
     norm = 0.0
     for j in range(y.size):
         top = 0.0
@@ -245,31 +226,29 @@ def step(c: Nodal, t: float, h: float, y: FloatArray, counters: IntArray) -> flo
         value = abs(h * top) / (tol * scale[j])
         if not value <= norm:
             norm = value
-    if net.mobile and norm <= 1.0:
+    if c.net.mobile and norm <= 1.0:
         # Beyond a fold there may be a solution that does not continue this one, and a step may reach it.
         for i in range(stages):
-            _stage(scheme, work, i, h, y)
-            copy_to(room.s, work.s[i])
-            copy_to(room.ds, work.ds[i])
-            if not network.rates(net, room, jump, work.stage, sign, work.rate):
+            _stage(c, i, h)
+            if not network.rates(c.net, c.room, c.jump, work.stage, c.sign, c.room.base):
                 return math.inf
     return norm if norm == norm else math.inf
 
 
 @jit
-def guess(scheme: Scheme, work: Work, start: FloatArray, h: float, h_before: float) -> None:
-    """Guess of the next step's stages from the polynomial of the step before or, without one, the derivative now."""
+def guess(scheme: Scheme, work: Work, h: float, h_before: float) -> None:
+    """Guess of the next step's stages from the polynomial of the step before or, without one, from `work.rate`."""
     follows = h_before > 0.0 and h <= FARTHEST * h_before
     for i in range(scheme.c.size):
         theta = 1.0 + scheme.c[i] * h / h_before if follows else 0.0
-        for j in range(start.size):
+        for j in range(work.rate.size):
             if follows:
                 value = 0.0
                 for d in range(work.poly.shape[1] - 1, -1, -1):
                     value = value * theta + (d + 1.0) * work.poly[j, d]
                 work.k[i, j] = value / h_before
             else:
-                work.k[i, j] = start[j]
+                work.k[i, j] = work.rate[j]
 
 
 @jit
@@ -312,44 +291,23 @@ SHORTEST, SHORTEST_FIRST = 1e-15, 1e-25
 ROUNDING = 1e-14
 
 
-class Passage(NamedTuple):
-    """An integration by implicit steps in progress."""
-
-    # y, s_before: State, and the sources' values just before the time reached; updated
-    y: FloatArray
-    s_before: FloatArray
-    # control, counters, peaks: Bookkeeping, updated; peaks (n_area,) in V
-    control: FloatArray
-    counters: IntArray
-    peaks: FloatArray
-    charge: bool  # Whether the output rows contain the sources' currents
-    # t_out, left, rows: Output times (s, ascending), whether the left-hand limit is meant, and the rows to fill: the
-    # state, then the currents
-    t_out: FloatArray
-    left: NDArray[np.bool_]
-    rows: FloatArray
-    # (n, 4): Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one, number
-    # from 1
-    tried: FloatArray
-
-
 @jit
-def _signed(c: Nodal, i: int, t: float, h: float, theta: float, y: FloatArray) -> float:
+def _signed(c: Nodal, i: int, t: float, h: float, theta: float) -> float:
     """Gap voltage i (V) at fraction `theta` of a step, times the sign of its branch: negative off the branch."""
-    _look(c, t, h, theta, y)
+    _look(c, t, h, theta)
     off: float = c.sign[i] * network.gap_voltage(c.net, c.room, i, c.work.stage)
     return off
 
 
 @jit
-def _look(c: Nodal, t: float, h: float, theta: float, y: FloatArray) -> None:
-    """State and sources at fraction `theta` of the step that starts at y, into `work.stage` and `room`."""
-    dense_state(theta, y, c.work.poly, c.work.stage)
-    network.at_sources(c.sources, c.work.place, c.work.base[0], t + theta * h, c.room.s, c.room.ds)
+def _look(c: Nodal, t: float, h: float, theta: float) -> None:
+    """State and sources at fraction `theta` of a step, into `work.stage` and `room`."""
+    dense_state(theta, c.y, c.work.poly, c.work.stage)
+    network.at_sources(c.sources, c.work.place, c.control[BASE], t + theta * h, c.room.s, c.room.ds)
 
 
 @jit
-def _first_zero(c: Nodal, t: float, h: float, y: FloatArray) -> tuple[float, int]:
+def _first_zero(c: Nodal, t: float, h: float) -> tuple[float, int]:
     """First fraction of the step at which a gap voltage leaves its branch, and the index of its area; 2 and -1 if none.
 
     Each gap voltage is sampled at the eighths of the step, and its sign change found by bisection.
@@ -358,11 +316,11 @@ def _first_zero(c: Nodal, t: float, h: float, y: FloatArray) -> tuple[float, int
     for i in range(c.sign.size):
         if c.net.gap[i] < 0:
             continue
-        lo, f_lo = 0.0, _signed(c, i, t, h, 0.0, y)
+        lo, f_lo = 0.0, _signed(c, i, t, h, 0.0)
         hi, f_hi = 0.0, 0.0
         for part in range(1, 9):
             hi = 0.125 * part
-            f_hi = _signed(c, i, t, h, hi, y)
+            f_hi = _signed(c, i, t, h, hi)
             if f_hi < 0.0:
                 break
             lo, f_lo = hi, f_hi
@@ -370,7 +328,7 @@ def _first_zero(c: Nodal, t: float, h: float, y: FloatArray) -> tuple[float, int
             continue
         while f_lo > 0.0 and hi - lo > 4e-16:
             middle = 0.5 * (lo + hi)
-            if _signed(c, i, t, h, middle, y) < 0.0:
+            if _signed(c, i, t, h, middle) < 0.0:
                 hi = middle
             else:
                 lo = middle
@@ -380,67 +338,55 @@ def _first_zero(c: Nodal, t: float, h: float, y: FloatArray) -> tuple[float, int
 
 
 @jit
-def _write_outputs(c: Nodal, run: Passage, t: float, h: float, t_new: float) -> None:
+def _write_outputs(c: Nodal, t: float, h: float, t_new: float) -> None:
     """Write the outputs of one step: right-hand limits in [t, t_new), left-hand limits in (t, t_new]."""
-    n_s, y, work, counters = c.net.b.shape[1], run.y, c.work, run.counters
-    while counters[OUTPUT] < run.t_out.size:
+    n_s, size, work, counters = c.net.b.shape[1], c.y.size, c.work, c.counters
+    while counters[OUTPUT] < c.t_out.size:
         i = counters[OUTPUT]
-        since = run.t_out[i] - work.base[0]
-        if since > t_new or (since == t_new and not run.left[i]):
+        since = c.t_out[i] - c.control[BASE]
+        if since > t_new or (since == t_new and not c.left[i]):
             return
-        _look(c, t, h, max(0.0, min((since - t) / h, 1.0)), y)
-        for j in range(y.size):
-            run.rows[i, j] = work.stage[j]
-        if run.charge:
+        _look(c, t, h, max(0.0, min((since - t) / h, 1.0)))
+        for j in range(size):
+            c.rows[i, j] = work.stage[j]
+        if c.charge:
             network.rates(c.net, c.room, False, work.stage, c.sign, work.rate)
             for j in range(n_s):
-                run.rows[i, y.size + j] = work.rate[y.size - n_s + j]
+                c.rows[i, size + j] = work.rate[size - n_s + j]
         counters[OUTPUT] += 1
 
 
 @jit
-def _account(c: Nodal, run: Passage, t: float, h: float) -> None:
+def _account(c: Nodal, t: float, h: float) -> None:
     """Update the largest |gap voltage| of every area (V), sampled at the ends and the quarters of a step."""
     for part in range(5):
-        _look(c, t, h, 0.25 * part, run.y)
-        for i in range(run.peaks.size):
+        _look(c, t, h, 0.25 * part)
+        for i in range(c.peaks.size):
             if c.net.gap[i] >= 0:
-                run.peaks[i] = max(run.peaks[i], abs(network.gap_voltage(c.net, c.room, i, c.work.stage)))
+                c.peaks[i] = max(c.peaks[i], abs(network.gap_voltage(c.net, c.room, i, c.work.stage)))
 
 
 @jit
-def _next_edge(c: Nodal, t: float, t_end: float) -> float:
-    """The next edge of a source after t, or `t_end` (s); the segments at t go into `work.place`."""
-    sources, place, stop = c.sources, c.work.place, t_end
-    for i in range(place.size):
-        while sources.edges[sources.first[i] + place[i] + 1] <= t:
-            place[i] += 1
-        stop = min(stop, sources.edges[sources.first[i] + place[i] + 1])
-    return stop
-
-
-@jit
-def _prepare(c: Nodal, run: Passage, now: FloatArray, slopes: FloatArray) -> bool:
+def _prepare(c: Nodal, now: FloatArray, slopes: FloatArray) -> bool:
     """Derivative of the state, into `work.rate`, and of the residual, where the sources are `now`; False at a fold."""
     copy_to(c.room.s, now)
     copy_to(c.room.ds, slopes)
-    network.choose_signs(c.net, c.room, c.jump, run.y, c.sign)
-    if not network.rates(c.net, c.room, c.jump, run.y, c.sign, c.work.rate):
+    network.choose_signs(c.net, c.room, c.jump, c.y, c.sign)
+    if not network.rates(c.net, c.room, c.jump, c.y, c.sign, c.work.rate):
         return False
-    copy_to(c.work.start, c.work.rate)
-    linearise(c, run.y)
-    run.counters[NFEV] += 2 + c.work.slope.shape[0]
+    linearise(c)
+    c.counters[NFEV] += 2 + c.work.slope.shape[0]
     return True
 
 
 @jit
-def _length(c: Nodal, run: Passage, room_left: float) -> float:
+def _length(c: Nodal, room_left: float) -> float:
     """Length of the next step, s: no more than is left to the next edge."""
-    h, longest = run.control[H], c.scheme.h_max
+    h, longest = c.control[H], c.scheme.h_max
     if h == 0.0:
         fastest = 0.0
         for j in range(c.work.slope.shape[0]):
-            fastest = max(fastest, abs(c.work.start[j]) / c.scale[j])
+            fastest = max(fastest, abs(c.work.rate[j]) / c.scale[j])
         h = min(longest, 0.1 / fastest if fastest > 0.0 else math.inf, room_left)
     h = min(h, longest)
     if h >= room_left * (1.0 - 1e-10):
@@ -449,15 +395,13 @@ def _length(c: Nodal, run: Passage, room_left: float) -> float:
 
 
 @jit
-def _accepted(
-    c: Nodal, run: Passage, t: float, h: float, h_before: float, room_left: float
-) -> tuple[float, float]:  # fmt: skip
+def _accepted(c: Nodal, t: float, h: float, h_before: float, room_left: float) -> tuple[float, float]:
     """Solve a step with ever shorter lengths until its error is small enough: the length (s; 0: none is), the error."""
-    counters = run.counters
+    counters = c.counters
     while True:
-        guess(c.scheme, c.work, c.work.start, h, h_before)
-        norm = step(c, t, h, run.y, counters)
-        note(run.tried, counters[ACCEPTED] + counters[REJECTED], c.work.base[0] + t, h, norm)
+        guess(c.scheme, c.work, h, h_before)
+        norm = step(c, t, h)
+        note(c.tried, counters[ACCEPTED] + counters[REJECTED], c.control[BASE] + t, h, norm)
         if norm <= 1.0:
             return h, norm
         counters[REJECTED] += 1
@@ -467,32 +411,32 @@ def _accepted(
 
 
 @jit
-def _move(c: Nodal, run: Passage, t: float, h: float, stop: float, last: bool) -> None:
+def _move(c: Nodal, t: float, h: float, stop: float, last: bool) -> None:
     """Write the outputs of a step, and move to its end: to `stop` (s) if it is the `last` one before an edge."""
-    control, base = run.control, c.work.base[0]
+    control, base = c.control, c.control[BASE]
     t_new = stop - base if last else t + h
     if not c.jump:
-        _write_outputs(c, run, t, h, t_new)
-    _account(c, run, t, h)
-    copy_to(run.y, c.work.y1)
+        _write_outputs(c, t, h, t_new)
+    _account(c, t, h)
+    copy_to(c.y, c.work.y1)
     if control[JUMPED] > 0.0:
         control[H_AFTER_JUMP] = h
         control[JUMPED] = 0.0
-    network.at_sources(c.sources, c.work.place, base, t_new, run.s_before, c.room.ds)
+    network.at_sources(c.sources, c.work.place, base, t_new, c.s_before, c.room.ds)
     control[BASE], control[T] = (stop, 0.0) if last else (base, t_new)
-    run.counters[ACCEPTED] += 1
+    c.counters[ACCEPTED] += 1
 
 
 @jit
-def advance(c: Nodal, run: Passage, t_end: float) -> int:
+def advance(c: Nodal, t_end: float) -> int:
     """Step a network to `t_end` (s) through the segments of its sources, writing outputs on the way.
 
     Returns DONE; JUMP: a source jumps at the time reached, and the caller must apply the jump first; STEP_UNDERFLOW; or
     PAUSED: call again.
     """
-    c, run = borrow(c), borrow(run)
-    work, control, counters, y, sign = c.work, run.control, run.counters, run.y, c.sign
-    now, slopes = np.zeros(run.s_before.size), np.zeros(run.s_before.size)
+    c = borrow(c)
+    work, control, counters, sign = c.work, c.control, c.counters, c.sign
+    now, slopes = np.zeros(c.s_before.size), np.zeros(c.s_before.size)
     work.place[:] = 0
     h_before = control[BEFORE]
     control[BEFORE] = 0.0
@@ -500,23 +444,22 @@ def advance(c: Nodal, run: Passage, t_end: float) -> int:
     pause = counters[ACCEPTED] + counters[REJECTED] + STEPS_AT_ONCE
     while control[BASE] + control[T] < t_end:
         base, t = control[BASE], control[T]
-        work.base[0] = base
-        stop = _next_edge(c, base + t, t_end)
+        stop = network.next_edge(c.sources, work.place, base + t, t_end)
         room_left = (stop - base) - t
         network.at_sources(c.sources, work.place, base, t, now, slopes)
         if not c.jump:
             for i in range(now.size):
-                if abs(now[i] - run.s_before[i]) > ROUNDING * max(abs(now[i]), abs(run.s_before[i])):
+                if abs(now[i] - c.s_before[i]) > ROUNDING * max(abs(now[i]), abs(c.s_before[i])):
                     return JUMP
-        if not _prepare(c, run, now, slopes):
+        if not _prepare(c, now, slopes):
             return STEP_UNDERFLOW
-        h, norm = _accepted(c, run, t, _length(c, run, room_left), h_before, room_left)
+        h, norm = _accepted(c, t, _length(c, room_left), h_before, room_left)
         if h == 0.0:
             return STEP_UNDERFLOW
         last = h == room_left
         proposed = h * min(6.0, 0.9 * norm ** (-1.0 / c.scheme.c.size) if norm > 0.0 else 6.0)
         dense_polynomial(work.k, c.scheme.dense, h, work.poly)
-        theta, which = (2.0, -1) if flips > 1 else _first_zero(c, t, h, y)
+        theta, which = (2.0, -1) if flips > 1 else _first_zero(c, t, h)
         if theta < 1.0:
             t_new = t + theta * h
             if t_new <= t:
@@ -527,14 +470,14 @@ def advance(c: Nodal, run: Passage, t_end: float) -> int:
                 continue
             # Repeat the step so that it ends on the zero: collocation is most accurate at the end of a step.
             h = t_new - t
-            if not step(c, t, h, y, counters) <= 2.0:
+            if not step(c, t, h) <= 2.0:
                 control[H] = 0.5 * h
                 h_before = 0.0
                 continue
             dense_polynomial(work.k, c.scheme.dense, h, work.poly)
             last = False
         flips = 0
-        _move(c, run, t, h, stop, last)
+        _move(c, t, h, stop, last)
         if which >= 0 and theta <= 1.0:
             sign[which] = -sign[which]
             counters[ZEROS] += 1
@@ -546,11 +489,8 @@ def advance(c: Nodal, run: Passage, t_end: float) -> int:
     return DONE
 
 
-def pass_jump(c: Nodal, y: FloatArray, before: FloatArray, counters: IntArray, peaks: FloatArray) -> bool:
-    """Take a state y through a jump of the sources from `before`, a ramp from 0 to 1; False where it meets a fold.
-
-    The arrays are updated as in `Passage`.
-    """
-    t_out, left, rows = read_only(np.zeros(0)), read_only(np.zeros(0, bool)), np.empty((0, y.size))
-    run = Passage(y, before, np.zeros(N_CONTROL), counters, peaks, False, t_out, left, rows, np.zeros((TRIED, 4)))
-    return bool(advance(c._replace(scheme=c.scheme._replace(h_max=1.0), jump=True), run, 1.0) == DONE)
+def pass_jump(c: Nodal, before: FloatArray) -> bool:
+    """Take the state through a jump of the sources from `before`, a ramp from 0 to 1; False where it meets a fold."""
+    scheme, control, tried = c.scheme._replace(h_max=1.0), np.zeros(N_CONTROL), np.zeros_like(c.tried)
+    through = c._replace(scheme=scheme, jump=True, s_before=before, control=control, tried=tried)
+    return bool(advance(through, 1.0) == DONE)

@@ -38,19 +38,6 @@ class Segment(NamedTuple):
 
 
 @jit
-def segment_at(edges: FloatArray, t: float) -> int:
-    """Index of the last edge that is not after t, or -1."""
-    low, high = -1, edges.size
-    while high - low > 1:
-        middle = (low + high) // 2
-        if edges[middle] <= t:
-            low = middle
-        else:
-            high = middle
-    return low
-
-
-@jit
 def term_at(term: FloatArray, tau: float) -> tuple[float, float]:
     """Value and slope of one term of a `Segment`, tau seconds into it."""
     value, slope, n, a = term[0], 0.0, term[1], term[2]
@@ -170,6 +157,17 @@ def at_sources(sources: Sources, index: IntArray, base: float, t: float, s: Floa
         # Each source has one edge more than it has segments.
         segment = Segment(start, length, sources.terms[row - i], sources.series[row - i])
         s[i], ds[i] = source(segment, (base - start) + t)
+
+
+@jit
+def next_edge(sources: Sources, index: IntArray, t: float, t_end: float) -> float:
+    """The next edge of a source after t, or `t_end` (s); the segments `index` (n_s,) become those at t."""
+    stop = t_end
+    for i in range(index.size):
+        while sources.edges[sources.first[i] + index[i] + 1] <= t:
+            index[i] += 1
+        stop = min(stop, sources.edges[sources.first[i] + index[i] + 1])
+    return stop
 
 
 @jit

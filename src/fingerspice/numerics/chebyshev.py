@@ -128,80 +128,70 @@ def to_powers(c: FloatArray, powers: FloatArray) -> bool:
 @jit_rows
 def evaluate_array(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
     """The series at (|x| - lo) scale - 1 into `out`, both of shape (n,); several at once in a processor's vector."""
-    powers = np.empty(c.size)
-    if to_powers(c, powers):
-        _horner(powers, x, lo, scale, out)
-    else:
-        _clenshaw(c, x, lo, scale, out)
-
-
-@jit_rows
-def _horner(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
-    x, out = borrow(x), borrow(out)
-    at, value = np.zeros(_BLOCK), np.zeros(_BLOCK)
+    x, out, powers, room = borrow(x), borrow(out), np.empty(c.size), np.zeros((4, _BLOCK))
+    as_powers, at, value = to_powers(c, powers), room[0], room[1]
     for first in range(0, x.size, _BLOCK):
         count = min(_BLOCK, x.size - first)
         # Views: an index with a sum in it keeps a loop from becoming vectors.
         here, there = x[first : first + count], out[first : first + count]
         for i in range(count):
             at[i] = (abs(here[i]) - lo) * scale - 1.0
-        k = c.size - 1
-        value[:] = c[k]
-        # Eight steps for each pass through memory.
-        while k >= 8:
-            c0, c1, c2, c3 = c[k - 1], c[k - 2], c[k - 3], c[k - 4]
-            c4, c5, c6, c7 = c[k - 5], c[k - 6], c[k - 7], c[k - 8]
-            for i in range(_BLOCK):
-                step = at[i]
-                half = (((value[i] * step + c0) * step + c1) * step + c2) * step + c3
-                value[i] = (((half * step + c4) * step + c5) * step + c6) * step + c7
-            k -= 8
-        while k > 0:
-            k -= 1
-            c0 = c[k]
-            for i in range(_BLOCK):
-                value[i] = value[i] * at[i] + c0
+        if as_powers:
+            _horner(powers, at, value)
+        else:
+            _clenshaw(c, at, room[2], room[3], value)
         for i in range(count):
             there[i] = value[i]
 
 
 @jit_rows
-def _clenshaw(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatArray) -> None:
-    x, out = borrow(x), borrow(out)
-    twice = np.empty(_BLOCK)
-    b1 = np.empty(_BLOCK)
-    b2 = np.empty(_BLOCK)
-    for first in range(0, x.size, _BLOCK):
-        count = min(_BLOCK, x.size - first)
-        if count < _BLOCK:
-            for i in range(_BLOCK):
-                twice[i] = 0.0
-        here, there = x[first : first + count], out[first : first + count]
-        for i in range(count):
-            twice[i] = 2.0 * ((abs(here[i]) - lo) * scale - 1.0)
+def _horner(c: FloatArray, at: FloatArray, value: FloatArray) -> None:
+    """The powers at a block of places."""
+    k = c.size - 1
+    for i in range(_BLOCK):
+        value[i] = c[k]
+    # Eight steps for each pass through memory.
+    while k >= 8:
+        c0, c1, c2, c3 = c[k - 1], c[k - 2], c[k - 3], c[k - 4]
+        c4, c5, c6, c7 = c[k - 5], c[k - 6], c[k - 7], c[k - 8]
         for i in range(_BLOCK):
-            b1[i] = 0.0
-            b2[i] = 0.0
-        k = c.size - 1
-        # Four steps of Clenshaw's recurrence for each pass through memory.
-        while k >= 4:
-            c0, c1, c2, c3 = c[k], c[k - 1], c[k - 2], c[k - 3]
-            for i in range(_BLOCK):
-                step = twice[i]
-                older = step * b1[i] + (c0 - b2[i])
-                newer = step * older + (c1 - b1[i])
-                older = step * newer + (c2 - older)
-                b1[i] = step * older + (c3 - newer)
-                b2[i] = older
-            k -= 4
-        for last in range(k, 0, -1):
-            c0 = c[last]
-            for i in range(_BLOCK):
-                newer = twice[i] * b1[i] + (c0 - b2[i])
-                b2[i] = b1[i]
-                b1[i] = newer
-        for i in range(count):
-            there[i] = c[0] + 0.5 * twice[i] * b1[i] - b2[i]
+            step = at[i]
+            half = (((value[i] * step + c0) * step + c1) * step + c2) * step + c3
+            value[i] = (((half * step + c4) * step + c5) * step + c6) * step + c7
+        k -= 8
+    while k > 0:
+        k -= 1
+        c0 = c[k]
+        for i in range(_BLOCK):
+            value[i] = value[i] * at[i] + c0
+
+
+@jit_rows
+def _clenshaw(c: FloatArray, at: FloatArray, b1: FloatArray, b2: FloatArray, value: FloatArray) -> None:
+    """The series at a block of places; `b1` and `b2` are scratch."""
+    for i in range(_BLOCK):
+        b1[i] = 0.0
+        b2[i] = 0.0
+    k = c.size - 1
+    # Four steps of Clenshaw's recurrence for each pass through memory.
+    while k >= 4:
+        c0, c1, c2, c3 = c[k], c[k - 1], c[k - 2], c[k - 3]
+        for i in range(_BLOCK):
+            step = 2.0 * at[i]
+            older = step * b1[i] + (c0 - b2[i])
+            newer = step * older + (c1 - b1[i])
+            older = step * newer + (c2 - older)
+            b1[i] = step * older + (c3 - newer)
+            b2[i] = older
+        k -= 4
+    for last in range(k, 0, -1):
+        c0 = c[last]
+        for i in range(_BLOCK):
+            newer = 2.0 * at[i] * b1[i] + (c0 - b2[i])
+            b2[i] = b1[i]
+            b1[i] = newer
+    for i in range(_BLOCK):
+        value[i] = c[0] + at[i] * b1[i] - b2[i]
 
 
 @jit

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.compiled import jit, jit_fused, jit_rows
 
 NODES = 13
@@ -62,6 +62,8 @@ for _i in range(NODES):
     for _j in set(range(NODES)) - {_i}:
         DERIVATIVE[_i, _j] = BARYCENTRIC[_j] / BARYCENTRIC[_i] / (_X[_i] - _X[_j])
     DERIVATIVE[_i, _i] = -DERIVATIVE[_i].sum()
+TO_SLOPES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN.T @ DERIVATIVE]).T)
+"""From values at the nodes to slopes at all rows, per step length, shape (NODES, ROWS): slopes = values @ TO_SLOPES."""
 _SCALE = float(np.abs(np.prod(_BETWEEN[:, None] - _X, axis=1)).max())
 MISS = np.prod(_BETWEEN[:, None] - _X, axis=1) / _SCALE
 """The node polynomial, of largest size 1, at the points between, shape (3,)."""
@@ -180,7 +182,7 @@ def fill_table(z: float, decay: FloatArray, phi: FloatArray, miss: FloatArray) -
         _fill_late(z, decay, phi, miss)
 
 
-@lru_cache(maxsize=1)
+@cache
 def integral_table() -> FloatArray:
     """`phi` of a mode with rate zero: integrals over [0, c_i] of the interpolant, shape (NODES, ROWS)."""
     phi = np.empty((NODES, ROWS))
@@ -188,8 +190,8 @@ def integral_table() -> FloatArray:
     return phi
 
 
-class Tableau(NamedTuple):
-    """A collocation method of s stages: order 2 s - 1 at the end of a step, stiffly accurate, L-stable."""
+class Scheme(NamedTuple):
+    """Radau IIA of s stages as numbers: order 2 s - 1 at the end of a step, stiffly accurate, L-stable."""
 
     a: FloatArray  # (s, s): Stage weights; the last row gives the end of the step
     c: FloatArray  # (s,): Stage times in units of the step, the last one 1
@@ -197,9 +199,15 @@ class Tableau(NamedTuple):
     # less could not follow
     e: FloatArray
     dense: FloatArray  # (s, s): x(t + theta h) = x + h sum_i sum_j K_i dense[i, j] theta^(j + 1), of order s
+    eigenvalues: ComplexArray  # (m,): Of `a`: one of each conjugate pair, and the real one
+    # to, back (m, s): a = Re(back diag(eigenvalues) to), so that each eigenvalue needs a linear system of n only
+    to: ComplexArray
+    back: ComplexArray
+    h_max: float  # s
 
 
-def radau(stages: int) -> Tableau:
+@cache
+def radau_scheme(stages: int) -> Scheme:
     """Radau IIA with `stages` nodes."""
     s = stages
     # Nodes: roots of P_s - P_{s-1} mapped to (0, 1]; the last is 1.
@@ -214,10 +222,19 @@ def radau(stages: int) -> Tableau:
     # of the interpolant cancel over many digits, and rounding would leave 3e-13 of a step of seven stages.
     at = [Fraction(float(x)) for x in c]
     dense = [[x / (d + 1) for d, x in enumerate(_cardinal(at, i))] for i in range(s)]
-    a = [[sum(x * t ** (d + 1) for d, x in enumerate(row)) for row in dense] for t in at]
+    a = np.array([[sum(x * t ** (d + 1) for d, x in enumerate(row)) for row in dense] for t in at], float)
     # The highest coefficient of the shifted Legendre polynomial of degree s is (2 s)! / s!^2.
     e = [row[-1] / math.comb(2 * s, s) for row in dense]
-    return Tableau(np.array(a, float), c, np.array(e, float), np.array(dense, float))
+    values, vectors = np.linalg.eig(a)
+    back = np.linalg.inv(vectors)
+    upper = np.flatnonzero(values.imag > -1e-12)
+    # Of a conjugate pair keep one eigenvalue: the pair's contribution is twice its real part.
+    twice = np.where(values.imag[upper] > 1e-12, 2.0, 1.0)
+    return Scheme(
+        a, c, np.array(e, float), np.array(dense, float), values[upper].astype(complex),
+        np.ascontiguousarray(back[upper].astype(complex)),
+        np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
+    )  # fmt: skip
 
 
 def _cardinal(at: list[Fraction], i: int) -> list[Fraction]:

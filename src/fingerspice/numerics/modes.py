@@ -211,8 +211,9 @@ def write_modes(
         if count > 0 and r[i] <= poles[count - 1] * (1.0 + 4e-16):
             share = shares[count - 1]
             # Mode of this element against the group so far, orthogonal in 1/k.
-            for j in range(n + 1):
-                if group[j] == count - 1 and j != i and _seen(order, j, i):
+            for place in range(m):
+                j = order[place]
+                if group[j] == count - 1:
                     shape[j, at] = k[j] / share
             shape[i, at] = -1.0
             norm = 1.0 / share + 1.0 / k[i]
@@ -240,14 +241,3 @@ def write_modes(
             shape[j, at] = k[j] * inverse
             feed[j, at] = -inverse / norm
         at += 1
-
-
-@jit
-def _seen(order: NDArray[np.int64], j: int, i: int) -> bool:
-    """Whether j comes before i in `order`."""
-    for m in range(order.size):
-        if order[m] == j:
-            return True
-        if order[m] == i:
-            return False
-    return False

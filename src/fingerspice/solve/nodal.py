@@ -22,8 +22,9 @@ from fingerspice.base.announcing import tell
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.engine import implicit
-from fingerspice.engine.implicit import Nodal, Passage, Scheme, advance, new_work, radau_scheme
+from fingerspice.engine.implicit import Nodal, advance, new_work
 from fingerspice.engine.network import Sources, new_room, ramp, rates_at
+from fingerspice.numerics.lobatto import Scheme, radau_scheme
 from fingerspice.results.outcome import Status
 from fingerspice.solve import runs
 from fingerspice.solve.problem import ROUNDING, Problem, Tables, segment_index, values_at
@@ -94,15 +95,16 @@ class Collocation(Integration):
 
     def nodal(self, sources: Sources) -> Nodal:
         """The network with these sources, as the compiled steps take it."""
-        return Nodal(self.net, self.room, self.scheme, self.work, sources, False, self.sign, self.scale, self.tol)
+        return Nodal(
+            self.net, self.room, self.scheme, self.work, sources, False, self.scale, self.tol, self.y, self.s_before,
+            self.sign, self.control, self.counters, self.peaks, self.tried, self.problem.charge, self.t_out, self.left,
+            self.rows,
+        )  # fmt: skip
 
     def through(self, sources: Sources, t_end: float) -> Status:
-        run = Passage(
-            self.y, self.s_before, self.control, self.counters, self.peaks, self.problem.charge, self.t_out, self.left,
-            self.rows, self.tried,
-        )  # fmt: skip
+        run = self.nodal(sources)
         while True:
-            code = advance(self.nodal(sources), run, t_end)
+            code = advance(run, t_end)
             if code == implicit.DONE:
                 return Status.SUCCESS
             if code == implicit.PAUSED:
@@ -116,8 +118,7 @@ class Collocation(Integration):
                 return self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        nodal = self.nodal(ramp(self.s_before, after))
-        met = implicit.pass_jump(nodal, self.y, self.s_before.copy(), self.counters, self.peaks)
+        met = implicit.pass_jump(self.nodal(ramp(self.s_before, after)), self.s_before.copy())
         self.s_before[:] = after
         self.control[[implicit.H, implicit.JUMPED]] = self.control[implicit.H_AFTER_JUMP], 1.0
         return met

@@ -23,14 +23,15 @@ from types import MappingProxyType
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, read_only
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
 from fingerspice.circuit.statespace import Stack
-from fingerspice.engine.implicit import N_COUNTERS, Nodal, new_work, pass_jump, radau_scheme
+from fingerspice.engine.implicit import N_COUNTERS, Nodal, new_work, pass_jump
 from fingerspice.engine.network import Net, new_room, ramp
 from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
+from fingerspice.numerics.lobatto import radau_scheme
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
@@ -326,8 +327,7 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[Fl
 def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatArray:
     """The state where Kirchhoff's residual `off` (n_cell,), V, has fallen to 0 linearly: a jump of one more source."""
     n, n_s = net.b.shape
-    y, counters, peaks = np.append(np.zeros(n), slow), np.zeros(N_COUNTERS, np.int64), np.zeros(net.gap.size)
-    y = np.append(y, np.zeros(n_s + 1))
+    y, none, signs = np.concatenate([np.zeros(n), slow, np.zeros(n_s + 1)]), np.zeros(0), np.zeros(net.gap.size)
     if np.any(off):
         wide = net._replace(
             q=np.column_stack([net.q, off]), b=np.zeros((n, n_s + 1)), through=np.vstack([net.through, 0.0 * off]),
@@ -337,8 +337,12 @@ def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatA
         scale, scheme = np.repeat([size, 1.0, size * held], [n, slow.size, n_s + 1]), radau_scheme(STAGES)
         work, room = new_work(wide, STAGES, scheme.eigenvalues.size, y.size), new_room(wide, y.size)
         before, after = np.append(s, 1.0), np.append(s, 0.0)
-        nodal = Nodal(wide, room, scheme, work, ramp(before, after), True, np.zeros(peaks.size), scale, STEP_ERROR)
-        if not pass_jump(nodal, y, before, counters, peaks):
+        nodal = Nodal(
+            wide, room, scheme, work, ramp(before, after), True, scale, STEP_ERROR, y, before, signs, none,
+            np.zeros(N_COUNTERS, np.int64), 0.0 * signs, np.zeros((1, 4)), False, read_only(none),
+            read_only(none > 0.0), np.empty((0, 0)),
+        )  # fmt: skip
+        if not pass_jump(nodal, before):
             where = PAST_FOLD if net.mobile else "where no area is left; allowed: less voltage"
             raise InputError(f"the capacitors' start voltages settle {where}")
     return y[:-1]

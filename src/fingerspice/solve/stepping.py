@@ -15,7 +15,6 @@ from fingerspice.engine.collocation.loop import Circuit, Looks
 from fingerspice.engine.collocation.readout import LoopState, Outputs
 from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Sources
-from fingerspice.numerics.lobatto import ROWS
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.steps import Recorder
@@ -219,7 +218,7 @@ class Stepping(Integration):
     def keep(self, steps: int) -> None:
         """Keep the steps from now on, at most `steps` of them."""
         # The loop fills in what it keeps: zeros would take longer than all of these steps.
-        self.kept = readout.Kept(np.empty((steps, 3)), np.empty((steps, len(self.out), ROWS)))
+        self.kept = readout.new_steps(steps, len(self.out))
         if steps:
             self.counters[readout.KEPT] = 0
             self.recorder.drain(self.counters)

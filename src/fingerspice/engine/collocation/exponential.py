@@ -13,8 +13,8 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray, aligned
 from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
 from fingerspice.engine.collocation.readout import Modal, row_of
-from fingerspice.engine.many_areas.form import evaluate_many, probe_many
-from fingerspice.engine.one_area.rows import evaluate_one, largest_size, probe_one
+from fingerspice.engine.many_areas.form import evaluate_many
+from fingerspice.engine.one_area.rows import evaluate_one, largest_size
 from fingerspice.numerics.lobatto import END, FIRST, LOBES, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 from fingerspice.numerics.modes import copy_to
 
@@ -41,10 +41,9 @@ def respond(forcing: FloatArray, phi: FloatArray, base: FloatArray, w: FloatArra
             w[k, i] = total + other
 
 
-# The nonlinear term of a circuit in a run at the modes of the step at hand, False beyond a fold; and at other modes,
-# with both as rows of `Modal.spare`.
+# The nonlinear term of a circuit in a run at the modes of the step at hand or, to probe it, at others; False beyond a
+# fold.
 _evaluate = jit_by_kind(OneArea=evaluate_one, ManyAreas=evaluate_many)
-_probe = jit_by_kind(OneArea=probe_one, ManyAreas=probe_many)
 
 
 @jit_within
@@ -70,7 +69,7 @@ def converge(circuit: Any, state: Any, tol: float) -> tuple[int, bool, float]:
         if iteration > 1:
             step = move_on(pull, used, weight, pull_before, left_before, slow)
             respond(used, phi, base, w)
-        if not _evaluate(circuit, state):
+        if not _evaluate(circuit, state, w, pull, False):
             return iteration, False, answer
         if iteration == 1:
             copy_to(guess, u)
@@ -298,7 +297,7 @@ def carry(circuit: Any, state: Any, gap: FloatArray, answer: float) -> None:
             used[k, i] = 0.0
     for iteration in range(_PASSES):
         _add(w, 1.0, off, shifted)
-        if not _probe(circuit, state, shifted, other):
+        if not _evaluate(circuit, state, shifted, other, True):
             break
         _add(other, -1.0, x.pull, shifted)
         move = move_on(shifted, used, x.weight, x.pull_before, x.left_before, iteration > 0)
@@ -314,22 +313,22 @@ def carry(circuit: Any, state: Any, gap: FloatArray, answer: float) -> None:
 def mode_error(
     x: Modal, k: int, lin: tuple[float, float, float], tables: Tables, slot: int, rows: tuple[int, int, int, int],
     magnified: float, error: float, off: FloatArray,
-) -> tuple[float, float, float]:  # fmt: skip
+) -> None:  # fmt: skip
     """Fill `places` with the errors of mode k at a step's start, the points between its nodes, and its end.
 
     They are the interpolation error of the forcing, of which `lin` is that of the linear part; the residual of the
     iteration; and the `error` at the start as carried on. The first has the response at `rows`, which goes into `off`
-    (4, m); it and the second are `magnified`. Returned is the interpolation error of the mode itself.
+    (4, m); it and the second are `magnified`. The interpolation error of the mode itself goes into `brief`.
     """
     pull, left, miss = between(tables.lobes, x.pull[k]), x.spare[5, k], tables.miss[slot, k]
-    places, carried = x.places[k], x.carried[k]
+    places, carried, brief = x.places[k], x.carried[k], x.brief[k]
     missed = largest((lin[0] + pull[0]) / MISS[0], (lin[1] + pull[1]) / MISS[1], (lin[2] + pull[2]) / MISS[2])
     left_over(tables.phi[slot, k], x.pull[k], x.used[k], left)
     places[0] = error
     for p in range(4):
         off[p, k] = magnified * miss[rows[p]] * missed
         places[p + 1] = carried[p] + magnified * left[p] + off[p, k]
-    return between(tables.lobes, x.w[k])
+    brief[1], brief[2], brief[3] = between(tables.lobes, x.w[k])
 
 
 @jit_rows

@@ -173,10 +173,18 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
     """
     # Arrays without a reference count: it would cost an atomic operation at every access to a tuple.
     circuit, state = borrow(circuit), borrow(state)
-    state.step[0].trusted = 1
-    _start(circuit, state)
+    step, control, counters = state.step[0], state.control[0], state.counters
+    # Other runs may have used the tables since the last call.
+    step.trusted, step.tabled, step.level, step.flips = 1, 0.0, -1, 0
+    if step.is_paused == 0:
+        _start(circuit, state)
+    step.is_paused = 0
     while True:
-        code: int = _begin(circuit, pace, state, t_end)
+        code: int = readout.TOO_MANY
+        if step.in_jump == 0 and control.t < t_end and counters[readout.RECORDED] >= state.steps.times.shape[0]:
+            step.is_paused, code = 1, readout.PAUSED
+        elif counters[readout.ACCEPTED] + counters[readout.REJECTED] <= step.most:
+            code = _begin(circuit, pace, state, t_end)
         if code == readout.GO_ON:
             code = _find_length(circuit, pace, state)
         if code == readout.GO_ON:

@@ -59,18 +59,16 @@ MOST_STEPS = 200_000
 # faster there.
 FIRST_PASSES, MOST_PASSES = 20_000, 2_000
 # Outputs are evaluated in groups as wide as the processor's vectors, and searched in strides.
-WRITTEN_AT_ONCE = _GROUP = 8
-_STRIDE = 32
+_GROUP, _STRIDE = 8, 32
 
 
 class Steps(NamedTuple):
-    """Takes every step, so that figures of the run do not depend on its outputs."""
+    """Takes finished steps, as many as there is room for."""
 
     # (capacity, 4): Start and length (s), the end reached (s), and which fraction of the length that is: a step may be
-    # shorter than the rounding of the time. No capacity: nothing is recorded.
+    # shorter than the rounding of the time
     times: FloatArray
-    # (capacity, n_column, NODES): Recorded voltages, or the state of a network, at the nodes of the whole length
-    values: FloatArray
+    values: FloatArray  # (capacity, n_column, NODES): The first output columns at the nodes of the whole length
 
 
 def new_steps(capacity: int, columns: int) -> Steps:
@@ -113,15 +111,15 @@ class Modal(NamedTuple):
     # w0, weight (m,): The modes at the start of the step; move of the gap voltage over it by a unit forcing of each
     w0: FloatArray
     weight: FloatArray
-    # places, carried (m, N_PLACES) and (m, N_PLACES - 1): Errors of the modes, and those carried over from earlier
-    # steps
+    # places, brief (m, N_PLACES), carried (m, N_PLACES - 1): Errors of the modes; those of their interpolation, which
+    # are zero at both ends; and those carried over from earlier steps
     places: FloatArray
+    brief: FloatArray
     carried: FloatArray
     run: FloatArray  # (n_area, N_PLACES): Errors of the gaps' voltages, V
     # values, coefficients (n_column, ROWS): Output columns and their Chebyshev coefficients
     values: FloatArray
     coefficients: FloatArray
-    outputs: FloatArray  # (2, WRITTEN_AT_ONCE): Scratch
     basis: FloatArray  # (NODES,): See `readout.basis_at`
     # u, guess (n_area, ROWS): Gap voltages now and an iteration before, V
     u: FloatArray
@@ -132,8 +130,8 @@ def new_modal(m: int, columns: int, u: FloatArray, guess: FloatArray) -> Modal:
     """Arrays for m modes and so many output columns, beside those of the gap voltages."""
     rows, wide = (m, ROWS), (columns, ROWS)
     shapes = (
-        rows, rows, rows, rows, rows, rows, (6, m, ROWS), (m,), (m,), (m, N_PLACES), (m, N_PLACES - 1),
-        (len(u), N_PLACES), wide, wide, (2, WRITTEN_AT_ONCE), (NODES,),
+        rows, rows, rows, rows, rows, rows, (6, m, ROWS), (m,), (m,), (m, N_PLACES), (m, N_PLACES),
+        (m, N_PLACES - 1), (len(u), N_PLACES), wide, wide, (NODES,),
     )  # fmt: skip
     return Modal._make((*aligned(shapes), u, guess))
 
@@ -214,10 +212,22 @@ def layers(
 
 
 @jit_rows
-def _series_at(
-    series: FloatArray, t_out: FloatArray, t: float, scale: float, top: float, groups: int, out: FloatArray
-) -> None:
-    """The series at whole groups of times, so that all round alike: the inner loop is unrolled, the outer a vector."""
+def _values_at(
+    series: FloatArray, powers: bool, t_out: FloatArray, t: float, scale: float, top: float, groups: int,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """The series at whole groups of times, so that all round alike: the inner loops are unrolled, the outer a vector.
+
+    With `powers` it has the coefficients of 1, x, x^2, ..., which halve the work.
+    """
+    if powers:
+        for i in range(_GROUP * groups):
+            x = min(max((t_out[i] - t) * scale - 1.0, -1.0), top)
+            value = series[NODES - 1]
+            for d in range(NODES - 2, -1, -1):
+                value = value * x + series[d]
+            out[i] = value
+        return
     for i in range(_GROUP * groups):
         x = min(max((t_out[i] - t) * scale - 1.0, -1.0), top)
         twice = 2.0 * x
@@ -228,19 +238,6 @@ def _series_at(
             b2 = b1
             b1 = b0
         out[i] = series[0] + x * b1 - b2
-
-
-@jit_rows
-def _powers_at(
-    powers: FloatArray, t_out: FloatArray, t: float, scale: float, top: float, groups: int, out: FloatArray
-) -> None:
-    """As `_series_at`, from the coefficients of 1, x, x^2, ...: half the work."""
-    for i in range(_GROUP * groups):
-        x = min(max((t_out[i] - t) * scale - 1.0, -1.0), top)
-        value = powers[NODES - 1]
-        for d in range(NODES - 2, -1, -1):
-            value = value * x + powers[d]
-        out[i] = value
 
 
 @jit
@@ -259,35 +256,30 @@ def _outputs_within(first: int, guess: int, low: float, high: float, t_out: Floa
 
 @jit
 def write_outputs(
-    t: float, h: float, reached: float, t_new: float, slack: float, powers: bool, series: FloatArray, work: FloatArray,
-    first: int, guess: int, outputs: Outputs,
+    t: float, h: float, reached: float, t_new: float, slack: float, powers: bool, series: FloatArray, first: int,
+    guess: int, outputs: Outputs,
 ) -> int:  # fmt: skip
     """Outputs of one step from number `first` on: right-hand ones in [t, t_new), left-hand ones in (t, t_new].
 
     With `powers` the series holds the coefficients of 1, x, x^2, ... instead. Times within `slack` of t_new are t_new;
     `guess` is the expected number. Places after the last output are overwritten: they belong to later steps.
-    `work` has shape (2, WRITTEN_AT_ONCE). Returns how many there were.
+    Returns how many there were.
     """
     t_out, out = outputs.t, outputs.columns
     count = _outputs_within(first, guess, t_new - slack, t_new + slack, t_out, outputs.left)
     groups = (count + _GROUP - 1) // _GROUP
     scale = 2.0 / h
     top = 2.0 * reached - 1.0
-    # The last group of a run may be too wide for the array: it is written through `work`.
+    # The last group of a run may be too wide for the array: it is written through another.
     whole = groups if first + _GROUP * groups <= t_out.size else groups - 1
     rest = first + _GROUP * whole
     for column in range(out.shape[0]):
-        if powers:
-            _powers_at(series[column], t_out[first:], t, scale, top, whole, out[column, first:])
-        else:
-            _series_at(series[column], t_out[first:], t, scale, top, whole, out[column, first:])
+        _values_at(series[column], powers, t_out[first:], t, scale, top, whole, out[column, first:])
         if whole < groups:
+            work = np.empty((2, _GROUP))
             for i in range(_GROUP):
                 work[0, i] = t_out[min(rest + i, t_out.size - 1)]
-            if powers:
-                _powers_at(series[column], work[0], t, scale, top, 1, work[1])
-            else:
-                _series_at(series[column], work[0], t, scale, top, 1, work[1])
+            _values_at(series[column], powers, work[0], t, scale, top, 1, work[1])
             for i in range(t_out.size - rest):
                 out[column, rest + i] = work[1, i]
     return count
@@ -327,19 +319,12 @@ SAME_TIME = 8e-16
 AT_ONCE = 1_000_000
 
 
-class Kept(NamedTuple):
-    """Steps kept for repetition."""
-
-    times: FloatArray  # (n_step, 3): Start, length and reached end of each step, s
-    series: FloatArray  # (n_step, n_column, ROWS): Chebyshev coefficients of the output columns over the whole length
-
-
 def repeat(
-    kept: Kept, count: int, period: float, periods: int, drifts: FloatArray, first: int, outputs: Outputs
+    kept: Steps, count: int, period: float, periods: int, drifts: FloatArray, first: int, outputs: Outputs
 ) -> int:  # fmt: skip
     """Write the outputs, from number `first` on, of so many periods (s) that follow the kept one of `count` steps.
 
-    `drifts` (n_column,) are the gains of the columns in a period; only charges have one, C. The kept series are used
+    `drifts` (n_column,) are the gains of the columns in a period; only charges have one, C. The kept values are used
     up. Returns the first output that is left.
     """
     # Of each step: its outputs in the period before, and whether it is in powers of x.
@@ -354,17 +339,16 @@ def repeat(
 
 @jit
 def _repeat(
-    kept: Kept, held: IntArray, as_powers: NDArray[np.bool_], period: float, begin: int, end: int, drifts: FloatArray,
+    kept: Steps, held: IntArray, as_powers: NDArray[np.bool_], period: float, begin: int, end: int, drifts: FloatArray,
     first: int, outputs: Outputs,
 ) -> int:  # fmt: skip
     """As `repeat`, of the periods from `begin` to before `end`."""
-    times, series = borrow(kept.times), borrow(kept.series)
+    times, series = borrow(kept.times), borrow(kept.values)
     outputs, drifts = borrow(outputs), borrow(drifts)
     t_out, out = outputs.t, outputs.columns
     held, as_powers = borrow(held), borrow(as_powers)
     if begin == 1:
-        _make_powers(series, as_powers)
-    work = np.zeros((2, WRITTEN_AT_ONCE))
+        _make_series(series, as_powers)
     for k in range(begin, end):
         shift = k * period
         before = first
@@ -379,8 +363,7 @@ def _repeat(
             reached = (times[i, 2] - times[i, 0]) / h
             # Mostly a period has as many outputs as the one before.
             held[i] = write_outputs(
-                times[i, 0] + shift, h, min(reached, 1.0), stop, slack, as_powers[i], series[i], work, first, held[i],
-                outputs,
+                times[i, 0] + shift, h, min(reached, 1.0), stop, slack, as_powers[i], series[i], first, held[i], outputs
             )  # fmt: skip
             first += held[i]
         for c in range(out.shape[0]):
@@ -391,21 +374,19 @@ def _repeat(
 
 
 @jit
-def _make_powers(series: FloatArray, made: NDArray[np.bool_]) -> None:
-    """Turn Chebyshev coefficients (n_step, n_column, ROWS) into those of 1, x, x^2, ..., which halve the work.
+def _make_series(values: FloatArray, as_powers: NDArray[np.bool_]) -> None:
+    """Turn values at the nodes (n_step, n_column, NODES) into coefficients of 1, x, x^2, ..., which halve the work.
 
-    This is done for steps where the powers are as exact, which `made` (n_step,) marks.
+    Where these are less exact they become those of Chebyshev series; `as_powers` (n_step,) marks the other steps.
     """
-    room = np.zeros(NODES)
-    for i in range(made.size):
-        made[i] = True
-        for c in range(series.shape[1]):
-            made[i] &= to_powers(series[i, c, :NODES], room)
-        if not made[i]:
-            continue
-        for c in range(series.shape[1]):
-            to_powers(series[i, c, :NODES], room)
-            copy_to(series[i, c, :NODES], room)
+    series = np.zeros((values.shape[1], ROWS))
+    for i in range(as_powers.size):
+        as_powers[i] = True
+        for c in range(values.shape[1]):
+            series_of(values[i, c], series[c])
+            as_powers[i] &= to_powers(series[c, :NODES], values[i, c])
+        if not as_powers[i]:
+            copy_to(values[i], series[:, :NODES])
 
 
 # Codes returned by the loop: the end is reached; no step is short enough (a fold, or an error that cannot be met); a
@@ -445,7 +426,6 @@ STEP = np.dtype([
     ("most", np.int64),  # Steps allowed
     ("unconverged", np.int64),  # Iterations of this call
     ("accepted_before", np.int64),  # Steps, before this call
-    ("pause_at", np.int64),  # So many accepted steps
     # Of a network
     ("has_begun", np.int64),  # Whether the call has
     ("in_jump", np.int64),  # Whether it is within a jump of the sources
@@ -473,8 +453,8 @@ class LoopState(NamedTuple):
     collected: FloatArray
     outputs: Outputs
     # Takes the first steps, for repeated periods, until it is full; `counters` tells how many steps there were
-    kept: Kept
-    steps: Steps  # Takes all steps, for figures of the run
+    kept: Steps
+    steps: Steps  # Takes all steps, so that figures of the run do not depend on its outputs
     # (TRIED, 4): Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one,
     # number from 1
     tried: FloatArray
@@ -493,41 +473,29 @@ def may_shorten(s: LoopState, since: float) -> bool:
     return True
 
 
-@jit_within
-def is_wanted(s: LoopState, t_new: float) -> bool:
-    """Whether a step that ends at `t_new` (s) has outputs, or is recorded or kept."""
-    first = s.counters[OUTPUT]
-    return (
-        s.steps.times.shape[0] > 0
-        or s.kept.times.size > 0
-        or (first < s.outputs.t.size and s.outputs.t[first] <= t_new)
-    )
+@jit
+def _take(steps: Steps, place: int, s: LoopState, t: float, values: FloatArray) -> None:
+    """Put a finished step that began at t (s), with its output columns (n_column, ROWS), into a place of `steps`."""
+    times, nodes, step = steps.times, steps.values, s.step[0]
+    times[place, 0], times[place, 1], times[place, 2], times[place, 3] = t, step.length, step.t_new, step.theta
+    for c in range(nodes.shape[1]):
+        for j in range(NODES):
+            nodes[place, c, j] = values[c, j]
 
 
 @jit_within
 def write_step(s: LoopState, t: float, x: Modal) -> None:
     """Record a finished step that began at t (s), keep it for repetition, and write its outputs."""
-    counters, kept_times, values, coefficients = s.counters, s.kept.times, x.values, x.coefficients
-    h, theta, t_new = s.step[0].length, s.step[0].theta, s.step[0].t_new
-    if s.steps.times.shape[0] > 0:
-        times, nodes, place = s.steps.times, s.steps.values, counters[RECORDED]
-        times[place, 0], times[place, 1], times[place, 2], times[place, 3] = t, h, t_new, theta
-        for c in range(nodes.shape[1]):
-            for j in range(NODES):
-                nodes[place, c, j] = values[c, j]
-        counters[RECORDED] += 1
-    first = counters[OUTPUT]
-    has_outputs = first < s.outputs.t.size and s.outputs.t[first] <= t_new
-    if not has_outputs and kept_times.size == 0:
-        return
-    for c in range(s.outputs.columns.shape[0]):
-        series_of(values[c], coefficients[c])
-    place = counters[KEPT]
+    counters, step, values, coefficients = s.counters, s.step[0], x.values, x.coefficients
+    _take(s.steps, counters[RECORDED], s, t, values)
+    counters[RECORDED] += 1
+    if counters[KEPT] < s.kept.times.shape[0]:
+        _take(s.kept, counters[KEPT], s, t, values)
     counters[KEPT] += 1
-    if place < kept_times.shape[0]:
-        kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
-        copy_to(s.kept.series[place], coefficients[: s.outputs.columns.shape[0]])
-    if has_outputs:
+    first = counters[OUTPUT]
+    if first < s.outputs.t.size and s.outputs.t[first] <= step.t_new:
+        for c in range(s.outputs.columns.shape[0]):
+            series_of(values[c], coefficients[c])
         counters[OUTPUT] += write_outputs(
-            t, h, theta, t_new, 0.0, False, coefficients, x.outputs, first, 0, s.outputs
+            t, step.length, step.theta, step.t_new, 0.0, False, coefficients, first, 0, s.outputs
         )  # fmt: skip

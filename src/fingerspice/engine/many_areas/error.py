@@ -95,7 +95,7 @@ def assess(c: Any, s: Any) -> float:
     for j in range(work.s.shape[0]):
         off[0, m + j], off[1, m + j], off[2, m + j] = between(c.tables.lobes, work.s[j])
     for k in range(m):
-        mode = mode_error(x, k, between(c.tables.lobes, lin[k]), c.tables, step.slot, _WORST, magnified, error[k], off)
+        mode_error(x, k, between(c.tables.lobes, lin[k]), c.tables, step.slot, _WORST, magnified, error[k], off)
         # The slope of the mode at the start shows such a decay: it differs by the decay's size times its rate.
         fall = 0.0
         for j in range(NODES):
@@ -103,8 +103,8 @@ def assess(c: Any, s: Any) -> float:
         fall = lin[k, 0] + pull[k, 0] - rates[k] * w[k, 0] - fall / h
         off[4, k] = fall / (rates[k] + 1.0 / (_EARLY * h))
         for p in range(3):
-            off[p, k] += mode[p]
-            places[k, p + 1] += mode[p]
+            off[p, k] += x.brief[k, p + 1]
+            places[k, p + 1] += x.brief[k, p + 1]
     largest_one: float = _largest_voltage(form.shape, form.follow, m, off)
     for k in range(n, m):
         for p in range(4):
@@ -186,47 +186,6 @@ def _leaks(
             for m in range(NODES):
                 slope += DERIVATIVE[i, m] * u[m]
             leak[i] += c * (more[i] - more[0]) * slope / h
-
-
-@jit_within
-def _charge_rows(
-    form: Form, work: Work, h: float, integral: FloatArray, z: FloatArray, current: FloatArray
-) -> None:  # fmt: skip
-    """Charge since the start of a step and current of each source at the nodes, into `z` and `current` (n_s, ROWS).
-
-    The derivatives of the modes, and the voltages and currents of the cells, have been put into `work`.
-    """
-    stored, stored_s, lost, lost_s = form.stored, form.stored_s, form.lost, form.lost_s
-    through, c, g, home = form.through, form.c, form.g, form.home
-    w, rate, s, ds = work.modal.w, work.d, work.s, work.ds
-    u, more, j, room = work.cells[forms.CELL_U], work.areas[forms.MORE], work.cells[forms.J], work.room
-    n = stored.shape[1]
-    collected, leak, moved = room[0], room[1], room[2]
-    multiply(stored, rate, None, current)
-    combine(stored_s, ds, 0, current)
-    for a in range(stored.shape[0]):
-        multiply(lost[a : a + 1], w, None, room[:1])
-        combine(lost_s[a : a + 1], s, 0, room[:1])
-        for i in range(ROWS):
-            z[a, i] = 0.0
-        for k in range(n):
-            for i in range(ROWS):
-                z[a, i] += stored[a, k] * (w[k, i] - w[k, 0])
-        for k in range(s.shape[0]):
-            for i in range(ROWS):
-                z[a, i] += stored_s[a, k] * (s[k, i] - s[k, 0])
-        for i in range(ROWS):
-            current[a, i] += collected[i]
-        for b in range(c.size):
-            share = through[a, b]
-            if share == 0.0:
-                continue
-            _leaks(form.mobile, h, c[b], g[b], u[b], more[home[b]], leak, moved)
-            for i in range(ROWS):
-                current[a, i] += share * j[b, i]
-                collected[i] += share * leak[i]
-                z[a, i] += share * moved[i]
-        integrate(integral, h, collected, z[a])
 
 
 @jit
@@ -363,14 +322,41 @@ def _area_missed(form: Form, source: int, work: Work, lobes: FloatArray) -> tupl
 def step_charges(
     form: Form, work: Work, h: float, integral: FloatArray, sign: FloatArray, z: FloatArray, current: FloatArray
 ) -> None:
-    """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
-    cells, w, cell_u = work.cells, work.modal.w, work.cells[forms.CELL_U]
-    forms.mode_rates(h, form.rates, w, work.lin, work.modal.pull, False, work.d)
-    multiply(form.tap, w[: form.shape.shape[0]], None, cell_u)
-    combine(form.tap_s, work.s, 0, cell_u)
-    multiply(work.own.root, cells[forms.RHO], None, cells[forms.J])
+    """Charges gained since the start of a converged step, and currents, of the sources at its nodes: (n_s, ROWS)."""
+    w, rate, s, ds, n = work.modal.w, work.d, work.s, work.ds, form.shape.shape[0]
+    stored, stored_s, c, g, home = form.stored, form.stored_s, form.c, form.g, form.home
+    u, more, j, room = work.cells[forms.CELL_U], work.areas[forms.MORE], work.cells[forms.J], work.room
+    collected, leak, moved = room[0], room[1], room[2]
+    forms.mode_rates(h, form.rates, w, work.lin, work.modal.pull, False, rate)
+    multiply(form.tap, w[:n], None, u)
+    combine(form.tap_s, s, 0, u)
+    multiply(work.own.root, work.cells[forms.RHO], None, j)
     if not form.mobile:
         for a in range(form.cell.size):
             if form.cell[a] >= 0 and form.slow[a] < 0:
                 forms.wanted(form, a, True, sign[a], work.areas)
-    _charge_rows(form, work, h, integral, z, current)
+    multiply(stored, rate, None, current)
+    combine(stored_s, ds, 0, current)
+    for a in range(stored.shape[0]):
+        multiply(form.lost[a : a + 1], w, None, room[:1])
+        combine(form.lost_s[a : a + 1], s, 0, room[:1])
+        for i in range(ROWS):
+            z[a, i] = 0.0
+        for k in range(n):
+            for i in range(ROWS):
+                z[a, i] += stored[a, k] * (w[k, i] - w[k, 0])
+        for k in range(s.shape[0]):
+            for i in range(ROWS):
+                z[a, i] += stored_s[a, k] * (s[k, i] - s[k, 0])
+        for i in range(ROWS):
+            current[a, i] += collected[i]
+        for b in range(c.size):
+            share = form.through[a, b]
+            if share == 0.0:
+                continue
+            _leaks(form.mobile, h, c[b], g[b], u[b], more[home[b]], leak, moved)
+            for i in range(ROWS):
+                current[a, i] += share * j[b, i]
+                collected[i] += share * leak[i]
+                z[a, i] += share * moved[i]
+        integrate(integral, h, collected, z[a])

@@ -26,10 +26,9 @@ from fingerspice.engine.collocation.readout import CONTROL, N_PLACES, Modal, new
 from fingerspice.engine.many_areas import coupling as couplings
 from fingerspice.engine.network import Sources
 from fingerspice.engine.one_area import rows as stack_rows
-from fingerspice.engine.one_area.rows import polynomial_rows
-from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, POINTS, ROWS, combine, multiply
+from fingerspice.engine.one_area.rows import area_rows, largest_size
+from fingerspice.numerics.lobatto import NODES, POINTS, ROWS, TO_SLOPES, combine, multiply
 from fingerspice.numerics.modes import copy_to
-from fingerspice.physics.contact import inverse_area
 
 # Blocks of the cells' rows: the parts of eta and chi that follow the sources, eta and chi, rho, shares of A', voltages,
 # currents.
@@ -110,7 +109,7 @@ class Jump(NamedTuple):
     # control (2,), sign: Bookkeeping before the jump and at its start, and branches of the areas before it
     control: NDArray[Any]
     sign: FloatArray
-    branch: FloatArray  # (n_area, 2): As `ManyAreas.branch`, by the fraction of the jump
+    branch: FloatArray  # (n_area, 2): `ManyAreas.branch` before it; within a jump it goes by the fraction of the jump
 
 
 class Work(NamedTuple):
@@ -165,10 +164,6 @@ def form_of(c: Any, s: Any) -> Form:
     return form
 
 
-# From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
-TO_RATES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN.T @ DERIVATIVE]).T)
-
-
 @jit_rows
 def mode_rates(
     h: float, rates: FloatArray, w: FloatArray, lin: FloatArray, pull: FloatArray, stiff_only: bool, out: FloatArray
@@ -180,7 +175,7 @@ def mode_rates(
             for i in range(ROWS):
                 total = 0.0
                 for m in range(NODES):
-                    total += TO_RATES[m, i] * w[k, m]
+                    total += TO_SLOPES[m, i] * w[k, m]
                 out[k, i] = total / h
         elif not stiff_only:
             for i in range(ROWS):
@@ -195,41 +190,22 @@ def clear(rows: FloatArray) -> None:
 
 
 @jit_rows
-def _highest(sign: float, u: FloatArray) -> float:
-    highest = 0.0
+def _inverted(q: FloatArray, dq: FloatArray, slopes_too: bool) -> None:
+    """The area and, if wanted, its slope in place of 1/A and the slope of that."""
     for i in range(ROWS):
-        highest = max(highest, sign * u[i])
-    return highest
-
-
-@jit_rows
-def _invert(area: FloatArray) -> None:
-    for i in range(ROWS):
-        area[i] = 1.0 / area[i]
-
-
-@jit_rows
-def _scale_slope(factor: float, area: FloatArray, slope: FloatArray) -> None:
-    for i in range(ROWS):
-        slope[i] *= factor * area[i] * area[i]
+        q[i] = 1.0 / q[i]
+    if slopes_too:
+        for i in range(ROWS):
+            dq[i] *= -q[i] * q[i]
 
 
 @jit
 def wanted(form: Form, a: int, slopes_too: bool, sign: float, areas: FloatArray) -> None:
     """Area a at its gap voltages on the branch of a sign and, if wanted, its derivative by them."""
-    curve, lo, scale = form.curves[a], form.lo[a], form.scale[a]
-    u, area, slope = areas[U, a], areas[AREA, a], areas[SLOPE, a]
-    if scale > 0.0 and _highest(sign, u) <= curve[1]:
-        polynomial_rows(form.powers[a], lo, scale, u, sign, area)
-        _invert(area)
-        if slopes_too:
-            polynomial_rows(form.slopes[a], lo, scale, u, sign, slope)
-            _scale_slope(-scale * sign, area, slope)
-    else:
-        for i in range(ROWS):
-            q, dq = inverse_area(max(sign * u[i], lo), curve)
-            area[i] = 1.0 / q
-            slope[i] = -sign * dq / (q * q)
+    curve, u, area, slope = form.curves[a], areas[U, a], areas[AREA, a], areas[SLOPE, a]
+    scale = form.scale[a] if largest_size(u) <= curve[1] else 0.0
+    area_rows(form.powers[a], form.slopes[a], form.lo[a], scale, curve, u, sign, slopes_too, area, slope)
+    _inverted(area, slope, slopes_too)
 
 
 @jit_rows
@@ -254,16 +230,20 @@ def _subtract(area: FloatArray, area0: float, more: FloatArray) -> None:
 
 
 @jit_within
-def _evaluate(
-    c: Any, s: Any, w: FloatArray, d: FloatArray, pull: FloatArray, cells: FloatArray, areas: FloatArray,
-    least: FloatArray,
-) -> bool:  # fmt: skip
-    """Forcing of the modes by the areas, into `pull` (m, ROWS), from the modes w (m, ROWS).
+def evaluate_many(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool) -> bool:
+    """Write the forcing of the modes w by the areas into `pull` (m, ROWS), and what it comes from into rows of `Work`.
 
-    `d` receives the derivatives of stiff modes. `cells` and `areas` are blocks of rows, whose parts that follow the
-    sources are given. False beyond a fold; under `mobile`, `least` (ROWS,) receives the distance to it.
+    With `probing`, the modes are not those of the step at hand, and other rows are taken, so that those of the step
+    stay as they are. False beyond a fold.
     """
     form, work, sign, h, several = form_of(c, s), c.work, c.sign, s.step[0].length, s.step[0].several > 0
+    # Derivatives of stiff modes, blocks of rows, and the distance to the fold.
+    d, cells, areas, least = work.d, work.cells, work.areas, work.room[3]
+    if probing:
+        d, cells, areas, least = work.modal.spare[5], work.spare_cells, work.spare_areas, work.room[1]
+        for part in (ETA_S, CHI_S, RHO):
+            copy_to(cells[part], work.cells[part])
+        copy_to(areas[U_S], work.areas[U_S])
     coupling, lin, rates, mobile = work.own, work.lin, form.rates, form.mobile
     n = form.gap.shape[1]
     stiff = coupling.key[1] > 0
@@ -336,7 +316,7 @@ def answer_mobile(
 
 @jit_within
 def follow_sources(form: Form, work: Work) -> None:
-    """The parts of a step's rows that depend on the sources alone; see `_evaluate`."""
+    """The parts of a step's rows that depend on the sources alone; see `evaluate_many`."""
     coupling, s, ds, lin, cells, areas = work.own, work.s, work.ds, work.lin, work.cells, work.areas
     n = form.gap.shape[1]
     multiply(form.gain, s, None, lin)
@@ -345,23 +325,10 @@ def follow_sources(form: Form, work: Work) -> None:
     combine(coupling.from_sources, s, 0, cells[ETA_S])
     multiply(coupling.from_slopes, s, None, cells[CHI_S])
     multiply(form.gap_s, s, None, areas[U_S])
-
-
-@jit_within
-def evaluate_many(c: Any, s: Any) -> bool:
-    """The forcing at the modes of the step at hand."""
-    work = c.work
-    return _evaluate(c, s, work.modal.w, work.d, work.modal.pull, work.cells, work.areas, work.room[3])
-
-
-@jit_within
-def probe_many(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
-    """The forcing at other modes w than those of the step at hand, whose own rows stay as they are."""
-    work, cells, areas = c.work, c.work.spare_cells, c.work.spare_areas
-    for part in (ETA_S, CHI_S, RHO):
-        copy_to(cells[part], work.cells[part])
-    copy_to(areas[U_S], work.areas[U_S])
-    return _evaluate(c, s, w, work.modal.spare[5], pull, cells, areas, work.room[1])
+    # Areas that do not follow a voltage stay as at the reference.
+    for a in range(form.area0.size):
+        for i in range(ROWS):
+            areas[AREA, a, i] = form.area0[a]
 
 
 @jit

@@ -21,7 +21,7 @@ from fingerspice.engine.many_areas import error as errors
 from fingerspice.engine.many_areas import form as forms
 from fingerspice.engine.many_areas.coupling import take_coupling
 from fingerspice.engine.many_areas.form import Form, Work
-from fingerspice.engine.network import Sources, at_sources
+from fingerspice.engine.network import Sources, at_sources, next_edge
 from fingerspice.engine.one_area.model import dot
 from fingerspice.engine.one_area.system import LEVEL_RATIO
 from fingerspice.numerics.lobatto import END, NODES, POINTS, combine, multiply
@@ -68,18 +68,8 @@ def find(references: References, form: Form, area: FloatArray) -> int:
     return -1
 
 
-@jit
-def start_at(area0: FloatArray, area: FloatArray) -> None:
-    """Areas (n_area, ROWS) as at their references."""
-    for a in range(area0.size):
-        for i in range(area.shape[1]):
-            area[a, i] = area0[a]
-
-
 # Relative change of a source at an edge that counts as rounding error, not as a jump.
 _ROUNDING, _UNNOTICED = 1e-14, 1e-9
-# Number of modes times steps between two pauses, in which Python can react to Ctrl-C.
-_AT_ONCE = 40_000
 
 
 class ManyAreas(NamedTuple):
@@ -105,24 +95,12 @@ class ManyAreas(NamedTuple):
     branch: FloatArray  # (n_area, 2): Time at which each area's branch began, and length of the branch before, s
 
 
-@jit_within
-def branch_of(c: ManyAreas, s: LoopState) -> FloatArray:
-    """Where the areas' branches began: in time, or within a jump."""
-    return c.work.jump.branch if s.step[0].in_jump > 0 else c.branch
-
-
 @jit
 def start(c: ManyAreas, s: LoopState) -> None:
-    """Begin a call of the loop, or go on after a pause, which changes nothing."""
+    """Begin a window of the sources."""
     form, work, step, counters = c.form, c.work, s.step[0], s.counters
     n = form.shape.shape[0]
-    step.pause_at = counters[readout.ACCEPTED] + 1 + _AT_ONCE // form.rates.size
-    # Other runs may have used the tables since the last call.
-    s.step[0].tabled = 0.0
-    if step.is_paused > 0:
-        step.is_paused = 0
-        return
-    step.flips, step.fresh = 0, step_control.NOT_FRESH
+    step.fresh = step_control.NOT_FRESH
     step.in_jump, step.has_begun, step.unconverged = 0, 0, 0
     step.accepted_before = counters[readout.ACCEPTED]
     step.several = 0
@@ -132,7 +110,6 @@ def start(c: ManyAreas, s: LoopState) -> None:
     for i in range(work.segment.size):
         work.segment[i] = 0
     work.areas[:] = 0.0
-    start_at(form.area0, work.areas[forms.AREA])
     for k in range(work.size.size):
         work.size[k] = form.size[k] if k < n else c.u_scale
 
@@ -140,20 +117,15 @@ def start(c: ManyAreas, s: LoopState) -> None:
 @jit
 def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
     """Where the next step starts: at an edge of a source, within a jump, or later; and its length."""
-    form, work, step, control, counters = c.form, c.work, s.step[0], s.control[0], s.counters
+    form, work, step, control = c.form, c.work, s.step[0], s.control[0]
     if step.in_jump > 0 and control.t >= 1.0:
         _leave_jump(c, s)
-    if counters[readout.ACCEPTED] + counters[readout.REJECTED] > step.most:
-        return readout.TOO_MANY
     step.stop, step.at_edge = 1.0, 0
     if step.in_jump > 0:
         copy_to(work.now, c.s_before)
     else:
         if step.has_begun > 0 and control.t >= t_end:
             return readout.DONE
-        if counters[readout.ACCEPTED] >= step.pause_at or counters[readout.RECORDED] >= s.steps.times.shape[0] > 0:
-            step.is_paused = 1
-            return readout.PAUSED
         _look_at_sources(c, s, t_end)
         if step.in_jump == 0 and control.t >= t_end:
             return readout.DONE
@@ -178,13 +150,10 @@ def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
 def _look_at_sources(c: ManyAreas, s: LoopState, t_end: float) -> None:
     """The sources' segments and values at the present time, and the next edge; a jump of any of them is entered."""
     work, step, sources, before, t = c.work, s.step[0], c.sources, c.s_before, s.control[0].t
-    segment, now, stop = work.segment, work.now, t_end
+    segment, now = work.segment, work.now
+    step.stop = next_edge(sources, segment, t, t_end)
     for i in range(now.size):
-        while sources.edges[sources.first[i] + segment[i] + 1] <= t:
-            segment[i] += 1
         step.at_edge |= int(sources.edges[sources.first[i] + segment[i]] == t)
-        stop = min(stop, sources.edges[sources.first[i] + segment[i] + 1])
-    s.step[0].stop = stop
     at_sources(sources, segment, t, 0.0, now, work.slopes_now)
     # The time at which a call starts may differ from an edge by rounding.
     least = _ROUNDING if step.at_edge > 0 else (math.inf if step.has_begun > 0 else _UNNOTICED)
@@ -207,7 +176,8 @@ def _enter_jump(c: ManyAreas, s: LoopState) -> None:
     copy_to(jump.sign, c.sign)
     copy_to(jump.before, c.s_before)
     copy_to(jump.after, c.work.now)
-    jump.branch[:] = 0.0
+    copy_to(jump.branch, c.branch)
+    c.branch[:] = 0.0
     s.control[0] = jump.control[1]
     control.error_q, control.magnified = jump.control[0].error_q, jump.control[0].magnified
     s.step[0].tabled, s.step[0].stop = 0.0, 1.0
@@ -232,6 +202,7 @@ def resume_time(c: ManyAreas, s: LoopState) -> None:
     jump, control = c.work.jump, s.control[0]
     jump.control[0].error_q, jump.control[0].magnified = control.error_q, control.magnified
     s.control[0] = jump.control[0]
+    copy_to(c.branch, jump.branch)
     s.step[0].in_jump = 0
 
 
@@ -239,7 +210,7 @@ def resume_time(c: ManyAreas, s: LoopState) -> None:
 def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
     """The areas at the start of a step and, where it is not known yet, the branch of each; the next zero to expect."""
     form, work, control, sign = c.form, c.work, s.control[0], c.sign
-    branch, in_jump, w0, now = branch_of(c, s), s.step[0].in_jump > 0, work.modal.w0, work.now
+    branch, in_jump, w0, now = c.branch, s.step[0].in_jump > 0, work.modal.w0, work.now
     ahead = math.inf
     control.branch_start, control.branch_length = t, math.inf
     for a in range(sign.size):
@@ -273,7 +244,6 @@ def _take_reference(c: ManyAreas, s: LoopState) -> bool:
     apply(form.inverse, x, s.error)
     work.at[0], s.step[0].tabled = found, 0.0
     copy_to(work.size[: form.shape.shape[0]], form.size)
-    start_at(form.area0, work.areas[forms.AREA])
     errors.load(form.inverse, form.follow, s.y, work.now, work.modal.w0)
     return True
 
@@ -297,7 +267,7 @@ def _take_coupling(c: ManyAreas, s: LoopState, h: float) -> None:
 def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
     form, work, x, step, tol = forms.form_of(c, s), c.work, c.work.modal, s.step[0], pace.tol
-    branch, t, in_jump, h, u = branch_of(c, s), s.control[0].t, s.step[0].in_jump > 0, s.step[0].length, x.u
+    branch, t, in_jump, h, u = c.branch, s.control[0].t, s.step[0].in_jump > 0, s.step[0].length, x.u
     if h != step.tabled:
         exponential.take_tables(c, s, -1 if in_jump else work.at[0], h, form.rates, work.size)
         _take_coupling(c, s, h)
@@ -370,8 +340,7 @@ def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     _cut_at_zero(c, pace, s, turned_enough)
     a = step.crossed
     if a >= 0 and step.t_new <= t:
-        branch = branch_of(c, s)
-        c.sign[a], branch[a, 0], branch[a, 1] = -c.sign[a], t, math.inf
+        c.sign[a], c.branch[a, 0], c.branch[a, 1] = -c.sign[a], t, math.inf
         step.flips += 1
         return readout.AGAIN
     if turned_enough:
@@ -388,10 +357,7 @@ def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
         return readout.NO_STEP
     control.magnified = max(control.magnified, step.grown)
     step.flips = 0
-    readout.basis_at(step.theta, work.modal.basis)
-    _write(c, pace, s, t)
-    _account(c, s)
-    _move(c, s)
+    _finish(c, pace.charge, s, t)
     if a >= 0:
         _cross(c, s, a)
     control.t = step.t_new
@@ -428,26 +394,20 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
 
 
 @jit_within
-def _write(c: ManyAreas, pace: Pace, s: LoopState, t: float) -> None:
-    """Charges of a step that began at t (s or, in a jump, a fraction), and its outputs."""
-    form, work, step, values = forms.form_of(c, s), c.work, s.step[0], c.work.modal.values
-    first_z, n_y = s.y.size - c.s_before.size, s.y.size
-    if pace.charge:
-        z, h = values[first_z:n_y], step.length
+def _finish(c: ManyAreas, charge: bool, s: LoopState, t: float) -> None:
+    """Charges, outputs, peaks and errors of a step that began at t (s, or a fraction of a jump), and its end."""
+    form, work, step, x, values = forms.form_of(c, s), c.work, s.step[0], c.work.modal, c.work.modal.values
+    n_y, n_s, theta, before, jump = s.y.size, c.s_before.size, step.theta, c.s_before, work.jump
+    readout.basis_at(theta, x.basis)
+    if charge:
+        z, h = values[n_y - n_s : n_y], step.length
         errors.step_charges(form, work, h, c.integral, c.sign, z, values[n_y:])
-        errors.charge_error(form, work, c.tables.lobes, h, step.theta, z, s.collected, s.control[0])
-    for e in range(c.s_before.size):
-        work.gained[e] = readout.at(values[first_z + e], work.modal.basis) if pace.charge else 0.0
-    if s.step[0].in_jump > 0 or not readout.is_wanted(s, step.t_new):
-        return
-    errors.write_columns(form.shape, form.follow, work.modal.w, work.s, s.y, pace.charge, values)
-    readout.write_step(s, t, work.modal)
-
-
-@jit_within
-def _account(c: ManyAreas, s: LoopState) -> None:
-    """Peaks of a step, and the errors of the run in it."""
-    form, work, areas, x = c.form, c.work, c.work.areas, c.work.modal
+        errors.charge_error(form, work, c.tables.lobes, h, theta, z, s.collected, s.control[0])
+    for e in range(n_s):
+        work.gained[e] = readout.at(values[n_y - n_s + e], x.basis) if charge else 0.0
+    if step.in_jump == 0:
+        errors.write_columns(form.shape, form.follow, x.w, work.s, s.y, charge, values)
+        readout.write_step(s, t, x)
     for a in range(c.sign.size):
         if form.stress[a] > 0.0:
             area_off = 0.0
@@ -455,31 +415,23 @@ def _account(c: ManyAreas, s: LoopState) -> None:
                 # The mode of a delayed area is the area itself.
                 for p in range(readout.N_PLACES):
                     area_off = max(area_off, abs(x.places[form.slow[a], p]))
-            readout.account(
-                x.u[a], areas[forms.AREA, a], form.stress[a], s.step[0].theta, x.run[a], area_off, s.peaks[a]
-            )  # fmt: skip
+            area = work.areas[forms.AREA, a]
+            readout.account(x.u[a], area, form.stress[a], theta, x.run[a], area_off, s.peaks[a])
     v_error = exponential.node_error(form.node, form.node_s, x.places, work.off)
     s.peaks[-1, readout.ERROR_U] = max(s.peaks[-1, readout.ERROR_U], v_error)
-
-
-@jit_within
-def _move(c: ManyAreas, s: LoopState) -> None:
-    """State and error at the end of a step, or where it is cut short."""
-    form, work, theta, t_new = c.form, c.work, s.step[0].theta, s.step[0].t_new
-    before, after = work.jump.before, work.jump.after
-    readout.end_at(theta, work.modal, s.error)
-    if s.step[0].in_jump > 0:
-        for e in range(before.size):
-            c.s_before[e] = before[e] + t_new * (after[e] - before[e])
+    readout.end_at(theta, x, s.error)
+    if step.in_jump > 0:
+        for e in range(n_s):
+            before[e] = jump.before[e] + step.t_new * (jump.after[e] - jump.before[e])
     else:
-        at_sources(c.sources, work.segment, t_new, 0.0, c.s_before, work.slopes_now)
-    errors.store(form.shape, form.follow, work.modal.w0, c.s_before, work.gained, s.y)
+        at_sources(c.sources, work.segment, step.t_new, 0.0, before, work.slopes_now)
+    errors.store(form.shape, form.follow, x.w0, before, work.gained, s.y)
 
 
 @jit_within
 def _cross(c: ManyAreas, s: LoopState, a: int) -> None:
     """Change the branch of area a at a zero of its gap voltage, which ends a step."""
-    control, branch, t_new = s.control[0], branch_of(c, s), s.step[0].t_new
+    control, branch, t_new = s.control[0], c.branch, s.step[0].t_new
     c.sign[a] = -c.sign[a]
     branch[a, 0], branch[a, 1] = t_new, t_new - branch[a, 0]
     s.counters[readout.ZEROS] += 1

@@ -5,23 +5,19 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.collocation.exponential import between
+from fingerspice.engine.collocation.exponential import between, largest
 from fingerspice.engine.collocation.readout import N_PLACES, Control, row_of
 from fingerspice.engine.one_area.model import Model
 from fingerspice.engine.one_area.rows import DQ, MORE, SCRATCH, SLOPE, SOURCE, X_GAP, Q, U, Work
-from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS, ROWS
+from fingerspice.numerics.lobatto import NODES, POINTS, ROWS, TO_SLOPES
 
 # The interpolation error of a rate changes its sign at every node, so that its integral is at most this fraction of its
 # largest value times the step length. The fraction is 0.03 to 0.14 where the error is a Chebyshev polynomial of degree
 # 13 to 21. Where the area changes tenfold within a step the error is no such polynomial; the fraction is then 0.22 in
 # scene 7391 of tests/stress.py.
 LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
-# Differentiation matrix for the points between the nodes, shape (3, NODES).
-_DERIVATIVE_BETWEEN = np.ascontiguousarray(BETWEEN.T @ DERIVATIVE)
 
 
 @jit_within
@@ -41,7 +37,7 @@ def charge_step(c: Any, s: Any, z: FloatArray, current: FloatArray) -> None:
     n = rates.size
     slow = model.slow
     voltage, leak = r[SCRATCH], r[MORE]
-    for j in range(NODES):
+    for j in range(ROWS):
         dv = 0.0
         v = 0.0
         dx_gap = 0.0
@@ -67,7 +63,7 @@ def charge_step(c: Any, s: Any, z: FloatArray, current: FloatArray) -> None:
     if not model.mobile and model.coupled:
         # Charge A c dv: exact with A at the start of the step; the change of A is integrated along the polynomial.
         _add_moves(slow[n + 1] / h, voltage, r[Q], leak)
-    missed, kept = _missed(model, slow_share, w, r, h, voltage, leak)
+    missed, kept = _missed(r[Q], leak, c.tables.lobes, h)
     for i in range(ROWS):
         z[i] = z0
     integrate(c.integral, h, leak, z)
@@ -75,25 +71,16 @@ def charge_step(c: Any, s: Any, z: FloatArray, current: FloatArray) -> None:
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control.peak_q = max(control.peak_q, abs(z[j]))
     kept = missed if theta < 1.0 else kept
-    _account(model, gap, slow_share, work, c.tables.lobes, h, theta, missed, kept, control, s.collected)
-
-
-@jit
-def _lobe(q: FloatArray) -> float:
-    """`LOBE`, or the larger value where the area changes more than tenfold within the step."""
-    lowest, highest = q[0], q[0]
-    for j in range(1, NODES):
-        lowest, highest = min(lowest, q[j]), max(highest, q[j])
-    return _STEEP_LOBE if highest > _STEEP * lowest else LOBE
+    _account(model, gap, slow_share, work, h, theta, missed, kept, control, s.collected)
 
 
 @jit_rows
 def _add_moves(factor: float, voltage: FloatArray, q: FloatArray, rate: FloatArray) -> None:
     """Add to `rate` factor (A - A at the start) times the slope of the voltage's polynomial, per step length."""
-    for j in range(NODES):
+    for j in range(ROWS):
         slope = 0.0
         for m in range(NODES):
-            slope += DERIVATIVE[j, m] * voltage[m]
+            slope += TO_SLOPES[m, j] * voltage[m]
         rate[j] += factor * (1.0 / q[j] - 1.0 / q[0]) * slope
 
 
@@ -108,8 +95,8 @@ def integrate(integral: FloatArray, h: float, rate: FloatArray, out: FloatArray)
 
 @jit
 def _account(
-    model: Model, gap: FloatArray, slow_share: FloatArray, work: Work, lobes: FloatArray, h: float, theta: float,
-    missed: float, kept: float, control: Control, collected: FloatArray,
+    model: Model, gap: FloatArray, slow_share: FloatArray, work: Work, h: float, theta: float, missed: float,
+    kept: float, control: Control, collected: FloatArray,
 ) -> None:  # fmt: skip
     """Update the largest error of the charge, over the part of a step that counts, from the signed error of the modes.
 
@@ -120,33 +107,25 @@ def _account(
     the latter. `missed` is the error of the charge within the step by interpolation of its rate, and `kept` the part of
     it that lasts, C.
     """
-    n, slow, r, w, places, spare = gap.size, model.slow, work.r, work.modal.w, work.modal.places, work.spare_r
+    n, slow, r, w, places, brief = gap.size, model.slow, work.r, work.modal.w, work.modal.places, work.modal.brief
     capacitance, g_area, g_total = slow[n + 1], slow[n + 2], slow[n + 3]
     last_area, last_voltage, last_gap, last_error, last_gap_error = 0.0, 0.0, 0.0, 0.0, 0.0
     last_theta = 0.0
     added = 0.0
     collected[1, 0] += kept * kept
-    brief, brief_gap = spare[0], spare[1]
-    for p in range(N_PLACES):
-        brief[p] = brief_gap[p] = 0.0
-    for k in range(n):
-        first, second, third = between(lobes, w[k])
-        for p, own in ((1, first), (2, second), (3, third)):
-            brief[p] += slow_share[k] * own
-            brief_gap[p] += gap[k] * own
     for p in range(N_PLACES):
         row = row_of(p)
         q = r[Q, row]
         area = 1.0 / q
-        v = 0.0
-        error = 0.0
-        gap_error = 0.0
+        v, error, gap_error, between_nodes, gap_between = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(n):
             v += slow_share[k] * w[k, row]
             error += slow_share[k] * places[k, p]
             gap_error += gap[k] * places[k, p]
+            between_nodes += slow_share[k] * brief[k, p]
+            gap_between += gap[k] * brief[k, p]
         now = capacitance * area * error
-        lasting, lasting_gap = error - brief[p], gap_error - brief_gap[p]
+        lasting, lasting_gap = error - between_nodes, gap_error - gap_between
         if model.mobile:
             # Q = A U / S + z has the error of A, too, by that of u, which the fold magnifies.
             scale = model.area0 * q
@@ -186,34 +165,17 @@ def _account(
 
 
 @jit
-def _missed(
-    model: Model, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, voltage: FloatArray, rate: FloatArray
-) -> tuple[float, float]:  # fmt: skip
+def _missed(q: FloatArray, rate: FloatArray, lobes: FloatArray, h: float) -> tuple[float, float]:
     """Error of the charge (C) within a step, and at its end, by interpolation of the charge's rate.
 
     Where the area falls by decades within a step, this error shows long before the voltages' own interpolation errors.
     At the end of the step the quadrature has twice the order of the interpolation: there the relative error of the rate
     counts squared.
     """
-    n = slow_share.size
-    slow = model.slow
-    worst = 0.0
-    for p in range(3):
-        q = r[Q, FIRST + p]
-        v = 0.0
-        for k in range(n):
-            v += slow_share[k] * w[k, FIRST + p]
-        scale = model.area0 * q if model.mobile else 1.0
-        off = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, FIRST + p] + v * scale)
-        slope = 0.0
-        for j in range(NODES):
-            off -= BETWEEN[j, p] * rate[j]
-            slope += _DERIVATIVE_BETWEEN[p, j] * voltage[j]
-        if not model.mobile and model.coupled:
-            off += slow[n + 1] / h * (1.0 / q - 1.0 / r[Q, 0]) * slope
-        worst = max(worst, abs(off))
-    largest = 0.0
+    first, second, third = between(lobes, rate)
+    worst = abs(largest(first, second, third))
+    lowest, highest, size = q[0], q[0], 0.0
     for j in range(NODES):
-        largest = max(largest, abs(rate[j]))
-    lobe = _lobe(r[Q]) * h * worst
-    return lobe, lobe * worst / largest if worst < largest else lobe
+        lowest, highest, size = min(lowest, q[j]), max(highest, q[j]), max(size, abs(rate[j]))
+    lobe = (_STEEP_LOBE if highest > _STEEP * lowest else LOBE) * h * worst
+    return lobe, lobe * worst / size if worst < size else lobe

@@ -154,12 +154,21 @@ def polynomial_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, 
 
 
 @jit
-def _long_area(curve: FloatArray, sign: float, r: FloatArray) -> None:
-    """1/A and its slope from Eq. 4 itself, where no series was found."""
-    for i in range(ROWS):
-        value, slope = inverse_area(max(sign * r[U, i], curve[0]), curve)
-        r[Q, i] = value
-        r[DQ, i] = slope * sign
+def area_rows(
+    powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray, u: FloatArray, sign: float,
+    slopes_too: bool, q: FloatArray, dq: FloatArray,
+) -> None:  # fmt: skip
+    """1/A and, if wanted, its slope by the gap voltage u at every row (see `System`); from Eq. 4 where `scale` is 0."""
+    if scale > 0.0:
+        polynomial_rows(powers, lo, scale, u, sign, q)
+        if slopes_too:
+            polynomial_rows(slopes, lo, scale, u, sign, dq)
+            for i in range(ROWS):
+                dq[i] *= scale * sign
+    else:
+        for i in range(ROWS):
+            q[i], slope = inverse_area(max(sign * u[i], lo), curve)
+            dq[i] = slope * sign
 
 
 @jit_rows
@@ -188,24 +197,26 @@ def _push(push: FloatArray, q0: float, area0: float, source: FloatArray, q: Floa
 
 
 @jit_within
-def _evaluate(c: Any, s: Any, w: FloatArray, r: FloatArray, pull: FloatArray) -> bool:
-    """Gap voltage, 1/A and nonlinear term, into `r` and `pull`, from the modes w, all as in `Work`.
+def evaluate_one(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool) -> bool:
+    """Write the nonlinear term at the modes w into `pull`, and the gap voltage and 1/A into the rows of `Work.r`.
 
-    If `system.scale` is 0 the area comes from Eq. 4, else from the polynomial or series. Under `mobile`, r[GUESS] holds
-    a guess of the gap voltage; False where the area equation was not solved on the branch connected to it.
+    With `probing`, the modes are not those of the step at hand, and other rows are taken, so that those of the step
+    stay as they are. False where, under `mobile`, the area equation was not solved on the branch connected to the guess
+    of the gap voltage.
     """
     system, level, sign, tapped = c.system, s.step[0].level, s.control[0].sign, c.work.tapped
-    model = system.model
+    model, r = system.model, c.work.spare_r if probing else c.work.r
     mobile, q0 = model.mobile, system.q0[level]
+    if probing:
+        copy_to(r[SOURCE], c.work.r[SOURCE])
+        copy_to(r[GUESS], c.work.r[U])
     multiply(system.gap[level : level + 1], w, None, r[X_GAP : X_GAP + 1])
     _gap_voltage(model.k_gap, r[SOURCE], r[X_GAP], r[U])
     if mobile:
         if not _solve_mobile(system, sign, r):
             return False
-    elif system.scale > 0.0:
-        polynomial_rows(system.powers, system.lo, system.scale, r[U], sign, r[Q])
     else:
-        _long_area(model.curve, sign, r)
+        _area(system, sign, False, r)
     multiply(system.tap[level], w, None, tapped)
     _leaked(system.tap_k, q0, r[SOURCE], r[Q], tapped)
     multiply(system.feed[level], tapped, None, pull)
@@ -214,36 +225,22 @@ def _evaluate(c: Any, s: Any, w: FloatArray, r: FloatArray, pull: FloatArray) ->
     return True
 
 
-@jit_within
-def evaluate_one(c: Any, s: Any) -> bool:
-    """The nonlinear term at the modes of the step at hand."""
-    return _evaluate(c, s, c.work.modal.w, c.work.r, c.work.modal.pull)
-
-
-@jit_within
-def probe_one(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
-    """The nonlinear term at other modes w than those of the step at hand, whose own rows stay as they are."""
-    work = c.work
-    copy_to(work.spare_r[SOURCE], work.r[SOURCE])
-    copy_to(work.spare_r[GUESS], work.r[U])
-    return _evaluate(c, s, w, work.spare_r, pull)
+@jit
+def _area(system: System, sign: float, slopes_too: bool, r: FloatArray) -> None:
+    area_rows(
+        system.powers, system.slopes, system.lo, system.scale, system.model.curve, r[U], sign, slopes_too, r[Q], r[DQ]
+    )  # fmt: skip
 
 
 @jit
 def _solve_mobile(system: System, sign: float, r: FloatArray) -> bool:
     """u = k U + b q(u) at all rows at once, by Newton; r[U] holds k U + x on entry."""
-    powers, lo, scale, area0 = system.powers, system.lo, system.scale, system.model.area0
+    area0 = system.model.area0
     for i in range(ROWS):
         r[FREE, i] = r[U, i] - r[X_GAP, i]
         r[U, i] = r[GUESS, i]
     for _ in range(30):
-        if scale > 0.0:
-            polynomial_rows(powers, lo, scale, r[U], sign, r[Q])
-            polynomial_rows(system.slopes, lo, scale, r[U], sign, r[DQ])
-            for i in range(ROWS):
-                r[DQ, i] *= scale * sign
-        else:
-            _long_area(system.model.curve, sign, r)
+        _area(system, sign, True, r)
         worst, size, lowest = 0.0, 0.0, 1.0
         for i in range(ROWS):
             size = max(size, abs(r[FREE, i]) + abs(r[U, i]))

@@ -2,8 +2,6 @@
 
 The functions that the loop calls take the run in progress as `s` (see `engine.collocation.readout`) and the stack as
 `c`.
-
-What remains of a step at its end are outputs, errors and the state.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from fingerspice.engine.collocation import exponential, readout, step_control
 from fingerspice.engine.collocation.exponential import Tables, between, largest
 from fingerspice.engine.collocation.readout import N_PLACES, LoopState
 from fingerspice.engine.collocation.step_control import Pace
-from fingerspice.engine.network import Segment, Sources, on_branch, segment_at, source
+from fingerspice.engine.network import Segment, Sources, on_branch, source
 from fingerspice.engine.one_area import rows
 from fingerspice.engine.one_area.charge import charge_step
 from fingerspice.engine.one_area.model import dot, turns_at_zero
@@ -48,17 +46,10 @@ class OneArea(NamedTuple):
 
 @jit_within
 def start(c: OneArea, s: LoopState) -> None:
-    """Begin a call of the loop: find the segment of the source, unless the run was paused."""
+    """Begin a window of the source."""
     step, control, counters = s.step[0], s.control[0], s.counters
-    # Other runs may have used the tables since the last call.
-    step.tabled, step.level, step.flips = 0.0, -1, 0
-    if step.is_paused > 0:
-        step.is_paused = 0
-        return
-    edges = c.sources.edges
-    step.index = segment_at(edges, control.t) - 1 if edges[0] < control.t else -1
-    # The segment is entered at the first step, as its edge is not before the present time.
-    step.start, step.edge, step.since, step.begun = 0.0, control.t, 0.0, control.t
+    # The segment is found and entered at the first step, as the edge is not after the present time.
+    step.index, step.start, step.edge, step.since, step.begun = -1, 0.0, control.t, 0.0, control.t
     step.fresh, step.evaluated = step_control.NOT_FRESH, counters[readout.NFEV]
     step.most = counters[readout.ACCEPTED] + counters[readout.REJECTED] + readout.MOST_STEPS
 
@@ -70,12 +61,7 @@ def begin(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
     model, t = c.system.model, control.t
     if not t < t_end:
         return readout.DONE
-    if counters[readout.RECORDED] >= s.steps.times.shape[0] > 0:
-        step.is_paused = 1
-        return readout.PAUSED
     evaluated = counters[readout.NFEV] - step.evaluated
-    if counters[readout.ACCEPTED] + counters[readout.REJECTED] > step.most:
-        return readout.TOO_MANY
     if evaluated > NODES * readout.FIRST_PASSES:
         longest = (t - step.begun) / pace.h_max
         if evaluated > NODES * (readout.FIRST_PASSES + readout.MOST_PASSES * longest):
@@ -201,12 +187,12 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
     sums[0, 0], sums[0, 1], sums[0, 2] = between(c.tables.lobes, r[U])
     for k in range(n):
         lin = (gain[k] * off[0, n], gain[k] * off[1, n], gain[k] * off[2, n])
-        mode = exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
+        exponential.mode_error(x, k, lin, c.tables, step.slot, (FIRST, SECOND, THIRD, END), 1.0, s.error[k], off)
         for p in range(4):
             sums[1, p] += gap[k] * off[p, k]
             sums[2, p] += gap[k] * places[k, p + 1]
-        for p in range(3):
-            places[k, p + 1] += mode[p]
+        for p in range(N_PLACES):
+            places[k, p] += x.brief[k, p]
     worst, magnified, run[0] = 0.0, 1.0, 0.0
     for p in range(4):
         row = readout.row_of(p + 1)
@@ -265,22 +251,17 @@ def _node_error(c: OneArea, level: int) -> float:
     Under `mobile` the voltages are the modes times 1/A: their error contains that of A, and the interpolation error of
     the product.
     """
-    system, r, w, places, lobes = c.system, c.work.r, c.work.modal.w, c.work.modal.places, c.tables.lobes
+    system, r, w, places, brief = c.system, c.work.r, c.work.modal.w, c.work.modal.places, c.work.modal.brief
     node, k_node, gap, area0 = system.node[level], system.k_node, system.gap[level], system.model.area0
     if not system.model.mobile:
         return exponential.node_error(node, k_node[:, np.newaxis], places, c.work.off)
     own, missed, values = np.zeros((places.shape[0], N_PLACES)), np.zeros(N_PLACES), np.zeros(ROWS)
     moved = np.zeros(N_PLACES)
     for p in range(N_PLACES):
-        for k in range(gap.size):
-            own[k, p] = area0 * r[Q, readout.row_of(p)] * places[k, p]
-    for k in range(gap.size):
-        missed[1], missed[2], missed[3] = between(lobes, w[k])
-        for p in range(N_PLACES):
-            own[k, p] -= area0 * r[Q, readout.row_of(p)] * missed[p]
-            moved[p] += gap[k] * own[k, p]
-    for p in range(N_PLACES):
         row = readout.row_of(p)
+        for k in range(gap.size):
+            own[k, p] = area0 * r[Q, row] * places[k, p] - area0 * r[Q, row] * brief[k, p]
+            moved[p] += gap[k] * own[k, p]
         moved[p] *= area0 * r[DQ, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
     worst = 0.0
     for i in range(k_node.size):
@@ -290,7 +271,7 @@ def _node_error(c: OneArea, level: int) -> float:
                 values[j] += node[i, k] * w[k, j]
             values[j] *= area0 * r[Q, j]
             values[j] += k_node[i] * r[SOURCE, j]
-        missed[1], missed[2], missed[3] = between(lobes, values)
+        missed[1], missed[2], missed[3] = between(c.tables.lobes, values)
         for p in range(N_PLACES):
             total = missed[p]
             for k in range(gap.size):
@@ -322,9 +303,7 @@ def complete(c: OneArea, pace: Pace, s: LoopState) -> int:
             step.theta, reached, step.crossed = crossing, since + crossing * h, 0
     step.flips = 0
     step.t_new = step.stop if reached == length else step.start + reached
-    _write(c, pace, s, t)
-    _account(c, s)
-    _move(c, pace.charge, s)
+    _finish(c, pace.charge, s, t)
     if step.crossed >= 0 and not _cross(c, s):
         return readout.NO_STEP
     control.t, step.since = step.t_new, reached
@@ -335,41 +314,27 @@ def complete(c: OneArea, pace: Pace, s: LoopState) -> int:
 
 
 @jit_within
-def _write(c: OneArea, pace: Pace, s: LoopState, t: float) -> None:
-    """Charge of a step that began at t (s), and its outputs."""
-    system, r, step, x = c.system, c.work.r, s.step[0], c.work.modal
-    model, shown, values = system.model, system.shown[step.level], x.values
+def _finish(c: OneArea, charge: bool, s: LoopState, t: float) -> None:
+    """Charge, outputs, peaks and errors of a step that began at t (s), and the state at its end or where it is cut."""
+    system, r, step, control, x, y = c.system, c.work.r, s.step[0], s.control[0], c.work.modal, s.y
+    model, shown, values, theta = system.model, system.shown[step.level], x.values, step.theta
     n_shown = shown.shape[0]
-    if pace.charge:
+    if charge:
         charge_step(c, s, values[n_shown], values[n_shown + 1])
-    if not readout.is_wanted(s, step.t_new):
-        return
     readout.layers(model.mobile, model.area0, system.k_shown, shown, x.w, r[SOURCE], r[Q], values)
     readout.write_step(s, t, x)
-
-
-@jit_within
-def _account(c: OneArea, s: LoopState) -> None:
-    """Peaks of a step, and the errors of the run in it."""
-    model, r, step, control = c.system.model, c.work.r, s.step[0], s.control[0]
     control.magnified = max(control.magnified, step.grown)
     for i in range(ROWS):
         r[SCRATCH, i] = 1.0 / r[Q, i]
     for i in range(NODES if model.mobile and model.coupled else 0):
-        if POINTS[i] <= step.theta:
+        if POINTS[i] <= theta:
             control.margin = min(control.margin, 1.0 - model.area0 * r[X_GAP, i] * r[DQ, i])
-    readout.account(r[U], r[SCRATCH], c.system.stress, step.theta, c.work.modal.run[0], 0.0, s.peaks[0])
+    readout.account(r[U], r[SCRATCH], system.stress, theta, x.run[0], 0.0, s.peaks[0])
     s.peaks[1, readout.ERROR_U] = max(s.peaks[1, readout.ERROR_U], _node_error(c, step.level))
-
-
-@jit_within
-def _move(c: OneArea, charge: bool, s: LoopState) -> None:
-    """State and error at the end of a step, or where it is cut short."""
-    system, r, x, control, step, y = c.system, c.work.r, c.work.modal, s.control[0], s.step[0], s.y
-    readout.basis_at(step.theta, x.basis)
-    readout.end_at(step.theta, x, s.error)
+    readout.basis_at(theta, x.basis)
+    readout.end_at(theta, x, s.error)
     if charge:
-        y[-1] = readout.at(x.values[system.shown.shape[1]], x.basis)
+        y[-1] = readout.at(values[n_shown], x.basis)
     control.last_q = readout.at(r[Q], x.basis)
     control.u_gap = 0.0 if step.crossed >= 0 else readout.at(r[U], x.basis)
     apply(system.live[step.level], x.w0, y)

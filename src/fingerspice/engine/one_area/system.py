@@ -14,7 +14,7 @@ the iteration is on the terms of the area alone.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,22 +83,15 @@ def build_system(
     voltages of the nodes from the live ones and U. `stress` is the force per area and squared gap voltage (Pa/V^2),
     `ratio` the largest one of neighbouring reference areas.
     """
-    forms = _forms(
-        model.mobile, model.area0, q_range[0], q_range[1], model.rate, model.rate0, model.k, model.gap, model.slow,
-        grouping, nodes, ratio,
-    )  # fmt: skip
-    return System(model, *forms, *area_polynomial(model.curve, tol), float(model.curve[1]), stress)
+    forms = _forms(model, q_range[0], q_range[1], grouping, nodes, ratio)
+    return System._make((model, *forms, *area_polynomial(model.curve, tol), float(model.curve[1]), stress))
 
 
 @jit
-def _forms(
-    mobile: bool, area0: float, lowest: float, highest: float, rate: FloatArray, rate0: FloatArray, k: FloatArray,
-    gap: FloatArray, slow: FloatArray, grouping: FloatArray, nodes: FloatArray, ratio: float,
-) -> tuple[
-    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray,
-    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray,
-]:  # fmt: skip
+def _forms(model: Model, lowest: float, highest: float, grouping: FloatArray, nodes: FloatArray, ratio: float) -> Any:
     """The arrays of a `System` from `q0` to `k_node`, for reference areas whose 1/A is from `lowest` to `highest`."""
+    mobile, area0, rate, rate0 = model.mobile, model.area0, model.rate, model.rate0
+    k, gap, slow = model.k, model.gap, model.slow
     n = gap.size
     levels = max(1, math.ceil(math.log(highest / lowest) / math.log(ratio)))
     leaking = np.flatnonzero(rate0 > 0.0)
