@@ -84,8 +84,9 @@ def limits(
     job.charge_law = None if capability else "mobile"
     job.answer.update(charge_law=job.charge_law)
     circuit = job.read()
-    other = not capability and (limit is not None or carrier is not None)
-    refuse(other, "--limit and --carrier belong to --capability")
+    if not capability:
+        refuse(limit is not None or carrier is not None, "--limit and --carrier belong to --capability")
+        study.grid_of(points, span)
     largest, tone = number("--limit", limit, positive=True), number("--carrier", carrier, positive=True)
     if capability and largest is None:
         # The peak of the deck's own sources.

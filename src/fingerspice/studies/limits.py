@@ -302,6 +302,13 @@ class FoldLimits(Shown):
         return write_csv(path, ("parameter", "value [SI]", "unit", "fold [V]"), rows)
 
 
+def grid_of(points: int, span: float) -> tuple[int, float]:
+    """Values of each parameter, and the factor to either side; those that `fold_limits` takes."""
+    points, span = whole_number("points", points, 3, 1000), real_number("span", span, "more than 1, at most 1e6")
+    require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
+    return points, span
+
+
 def fold_limits(
     circuit: Circuit, *, points: int = 9, span: float = 10.0, progress: Progress | None = None
 ) -> FoldLimits:
@@ -330,8 +337,7 @@ def fold_limits(
         If a run fails for another reason than a fold.
     """
     require_circuit(circuit)
-    points, span = whole_number("points", points, 3, 1000), real_number("span", span, "more than 1, at most 1e6")
-    require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
+    points, span = grid_of(points, span)
     gaps = circuit.by_device("GAP")
     found = ", ".join(g.name for g in gaps) or "none"
     refuse(len(gaps) != 1, f"a map of the fold needs one GAP whose area follows it; this circuit has {found}")
