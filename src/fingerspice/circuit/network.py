@@ -425,13 +425,13 @@ def phasor_areas(network: Network, mode: str | float, f: float, amplitude: float
     area = network.areas_at_rest if isinstance(mode, str) else np.full(len(network.areas), mode)
     if mode != "mean" or all(a.given is not None for a in network.areas):
         return area
-    names = [e.name for e in network.layers]
+    names, fingers = [e.name for e in network.layers], enumerate(zip(network.areas, network.contacts, strict=True))
+    free = [(i, names.index(a.gap.name), c) for i, (a, c) in fingers if a.given is None and a.gap and c is not None]
 
     def following(area: FloatArray) -> FloatArray:
         u, new = np.abs(amplitude * network.layer_gain(f, area)) / math.sqrt(2.0), area.copy()
-        for i, (own, contact) in enumerate(zip(network.areas, network.contacts, strict=True)):
-            if own.given is None and own.gap is not None and contact is not None:
-                new[i] = float(contact.area(u[names.index(own.gap.name)]))
+        for i, layer, contact in free:
+            new[i] = contact.area(u[layer])
         return new
 
     return settled_areas(following, area)

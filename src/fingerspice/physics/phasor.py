@@ -5,6 +5,7 @@ Written from the impedances, in their own order, and sharing nothing with the st
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -29,22 +30,23 @@ def layer_gains(admittance: ArrayLike) -> ComplexArray:
 
 
 def settled_areas(following: Callable[[FloatArray], FloatArray], area: FloatArray) -> FloatArray:
-    """Areas (n,) that follow from their own voltages, by the secant method for each; `area` is the first guess (m^2).
+    """Areas (n,) that follow from their own voltages, to rounding, by the secant method for each, m^2.
 
-    `following` gives the areas that follow from the voltages at areas. Where an area answers strongly, going on from
-    these would swing between two values for ever.
+    `following` gives the areas that follow from the voltages at areas; the first guess is `area`. Where an area answers
+    strongly, going on from what follows would swing between two values for ever.
     """
-    before: tuple[FloatArray, FloatArray] | None = None
-    for _ in range(200):
+    before, last = (area, area), math.inf
+    for attempt in range(200):
         new = following(area)
         step = new - area
-        # NaN and inf cannot converge: return them, for the caller to refuse.
-        if np.all(np.abs(step) <= 2e-15 * area) or not np.all(np.isfinite(new)):
+        off = float(np.abs(step / area).max())
+        # At the rounding of the network's voltages steps grow no smaller. NaN and inf are for the caller to refuse.
+        if off <= 1e-14 or last <= off < (1e-12 if attempt < 100 else 1e-9) or not math.isfinite(off):
             return new
         share = np.ones(area.size)
-        if before is not None:
+        if attempt:
             with np.errstate(divide="ignore", invalid="ignore"):
-                secant = (before[0] - area) / (step - before[1])
-            share = np.where(secant > 0.0, np.clip(secant, 1e-3, 4.0), 1.0)
-        before, area = (area, step), np.maximum(area + share * step, 0.1 * new)
+                share = (before[0] - area) / (step - before[1])
+            share = np.where(share > 0.0, np.minimum(np.maximum(share, 1e-3), 4.0), 1.0)
+        before, last, area = (area, step), off, np.maximum(area + share * step, 0.1 * new)
     raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")
