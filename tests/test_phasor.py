@@ -19,10 +19,11 @@ from analytic import GAP, Layer, area, coupled_phasor, periodic_state, sine_segm
 from commands import Command
 from deck_edits import edited
 from fingerspice.circuit.circuit import AcSweep
-from fingerspice.physics.phasor import coupled_area
+from fingerspice.circuit.network import network_of
+from fingerspice.physics.phasor import settled_areas
 from fingerspice.studies.steady import sweep_frequencies
 from ngspice_tools import CIRCUITS, call_ngspice
-from scenes import deck, listed, table1, table1_deck
+from scenes import deck, listed, shipped, table1, table1_deck
 
 MM2 = 1e6
 FREQUENCIES = [1.0, 10.0, 100.0, 700.0, 5000.0, 1e5]
@@ -117,7 +118,7 @@ def test_the_coupled_area_solves_its_equation_for_any_monotone_area_and_gain(amp
     def gain_of(area: float) -> float:
         return 0.2 + 0.7 * area ** (1.0 + steepness)
 
-    a = coupled_area(area_of, gain_of, amplitude)
+    (a,) = settled_areas(lambda a: np.array([area_of(amplitude * gain_of(a[0]) / math.sqrt(2.0))]), np.ones(1))
     assert area_of(amplitude * gain_of(a) / math.sqrt(2.0)) == pytest.approx(a, rel=1e-12)
 
 
@@ -314,6 +315,13 @@ def test_a_networks_phasor_has_its_mean_area_and_its_skins_data_at_each_frequenc
     for i, f in enumerate(frequencies):
         assert held.gain[i] == pytest.approx(gain(name, f, float(area(0.0)), 5e3), rel=1e-11)
     assert abs(held.gain[-1] / p.gain[-1] - 1.0) > 1e-3
+
+
+def test_areas_settle_though_a_networks_rounding_moves_them() -> None:
+    circuit = shipped("two_fingers").replace({"Xfirm.Xgap.d": 1e-7})
+    p = fs.phasor(circuit, 100.0, finger="Xfirm.Xgap")
+    own = dict(network_of(circuit).named_contacts)["Xfirm.Xgap"]
+    assert p.area[0] == pytest.approx(float(own.area(abs(p.u_gap[0]) / math.sqrt(2.0))), rel=1e-11)
 
 
 @pytest.mark.parametrize("given", [-35e-6, 0.0, math.nan, math.inf, -math.inf])

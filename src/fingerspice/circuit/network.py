@@ -29,7 +29,7 @@ from fingerspice.circuit.devices import check
 from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of, find_branches, shared
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
-from fingerspice.physics.phasor import coupled_area, layer_gains
+from fingerspice.physics.phasor import layer_gains, settled_areas
 from fingerspice.waveforms.waveform import Sum, Waveform, refuse, require
 
 _ROUNDING = 1e-13  # A current of a source that is this small, relative to what it is the difference of, is rounding.
@@ -425,21 +425,13 @@ def phasor_areas(network: Network, mode: str | float, f: float, amplitude: float
     area = network.areas_at_rest if isinstance(mode, str) else np.full(len(network.areas), mode)
     if mode != "mean" or all(a.given is not None for a in network.areas):
         return area
-    stack, finger, s = network.stack, network.contacts[0], np.array([complex(amplitude)])
-    if stack is not None and finger is not None:
+    names, fingers = [e.name for e in network.layers], enumerate(zip(network.areas, network.contacts, strict=True))
+    free = [(i, names.index(a.gap.name), c) for i, (a, c) in fingers if a.given is None and a.gap and c is not None]
 
-        def gain(area: float) -> float:
-            return float(np.abs(layer_gains(stack.admittance(f, area))[0, stack.gap_layer]))
+    def following(area: FloatArray) -> FloatArray:
+        u, new = np.abs(amplitude * network.layer_gain(f, area)) / math.sqrt(2.0), area.copy()
+        for i, layer, contact in free:
+            new[i] = contact.area(u[layer])
+        return new
 
-        return np.array([coupled_area(lambda u: float(finger.area(u)), gain, amplitude)])
-    for attempt in range(500):
-        u, new = np.abs(network.phasors(f, area, s)), area.copy()
-        for i, (contact, gap) in enumerate(zip(network.contacts, network.gaps, strict=True)):
-            if network.areas[i].given is None and contact is not None and gap is not None:
-                new[i] = float(contact.area(float(u[gap]) / math.sqrt(2.0)))
-        # NaN and inf cannot converge: return them, for the caller to refuse.
-        if np.all(np.abs(new - area) <= 4e-16 * area) or not np.all(np.isfinite(new)):
-            return new
-        # The fixed-point iteration may oscillate between two values: after 50 iterations, damp it by taking the mean.
-        area = new if attempt < 50 else 0.5 * (area + new)
-    raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")
+    return settled_areas(following, area)

@@ -11,7 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import ComplexArray
+from fingerspice.base.arrays import ComplexArray, FloatArray
+from fingerspice.base.errors import InputError
 
 
 def layer_gains(admittance: ArrayLike) -> ComplexArray:
@@ -28,21 +29,24 @@ def layer_gains(admittance: ArrayLike) -> ComplexArray:
     return np.asarray(z / z.sum(-1, keepdims=True))
 
 
-def coupled_area(area_of: Callable[[float], float], gain_of: Callable[[float], float], amplitude: float) -> float:
-    """Area A = g(U_gap / sqrt 2), coupled through the mean stress and iterated to rounding (m^2).
+def settled_areas(following: Callable[[FloatArray], FloatArray], area: FloatArray) -> FloatArray:
+    """Areas (n,) that follow from their own voltages, to rounding, by the secant method for each, m^2.
 
-    It follows from g, gap voltage (V) to ridge contact area (m^2), from `gain_of`, area (m^2) to |U_gap / U_0| (Eq.
-    11), and from the amplitude U_0 (V). The gain lies between 0 and 1, so the root of u - U_0 |gain(g(u / sqrt 2))| is
-    bracketed by 0 and U_0. Where the area answers strongly, iterating on it would swing between two values for ever.
+    `following` gives the areas that follow from the voltages at areas; the first guess is `area`. Where an area answers
+    strongly, going on from what follows would swing between two values for ever.
     """
-    lo, hi, before = 0.0, abs(amplitude), math.inf
-    u = hi
-    for _ in range(200):
-        new = abs(amplitude) * gain_of(area_of(u / math.sqrt(2.0)))
-        lo, hi = (u, hi) if new > u else (lo, u)
-        if min(abs(new - u), hi - lo) <= 3e-16 * abs(u):
-            break
-        # The map contracts strongly in most scenes; where it does not halve the bracket, bisection does.
-        u = new if hi - lo <= 0.5 * before and lo <= new <= hi else 0.5 * (lo + hi)
-        before = hi - lo
-    return float(area_of(u / math.sqrt(2.0)))
+    before, last = (area, area), math.inf
+    for attempt in range(200):
+        new = following(area)
+        step = new - area
+        off = float(np.abs(step / area).max())
+        # At the rounding of the network's voltages steps grow no smaller. NaN and inf are for the caller to refuse.
+        if off <= 1e-14 or last <= off < (1e-12 if attempt < 100 else 1e-9) or not math.isfinite(off):
+            return new
+        share = np.ones(area.size)
+        if attempt:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = (before[0] - area) / (step - before[1])
+            share = np.where(share > 0.0, np.minimum(np.maximum(share, 1e-3), 4.0), 1.0)
+        before, last, area = (area, step), off, np.maximum(area + share * step, 0.1 * new)
+    raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")

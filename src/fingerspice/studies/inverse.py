@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from fingerspice.circuit.statespace import find_branches
 from fingerspice.engine.inverse import drive_stack
 from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.plots import drawing
-from fingerspice.results.record import Sealed
+from fingerspice.results.record import Sealed, attribute
 from fingerspice.solve.simulation import simulate
 from fingerspice.waveforms.files import read_text_columns
 from fingerspice.waveforms.periodic import PWL
@@ -179,6 +179,10 @@ def on_carrier(carrier: float | None) -> str:
     return "without a carrier" if carrier is None else f"on a carrier of {format_si(carrier, 'Hz')}"
 
 
+def _figure(key: str, doc: str) -> float:
+    return attribute(lambda found: found._figures[key], doc=doc)  # type: ignore[no-any-return]
+
+
 @dataclass(frozen=True, repr=False)
 class InverseDrive(Sealed, Shown):
     """A drive, the force and friction wanted from it, and those that a forward run gives.
@@ -223,31 +227,22 @@ class InverseDrive(Sealed, Shown):
     at_limit: float
     corrections: int
 
-    @property
-    def _asked(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The quantity asked for, as wanted and as reached, and the difference, N."""
-        wanted, reached = (self.wanted, self.force) if self.kind == "force" else (self.wanted_friction, self.friction)
-        return wanted, reached, reached - wanted
+    worst = _figure("worst", "Largest difference between reached and wanted force or friction, N.")
+    rms = _figure("rms", "Root mean square of the difference between reached and wanted force or friction, N.")
+    worst_share = _figure("worst_share", "`worst` relative to the largest wanted value.")
+    rms_share = _figure("rms_share", "`rms` relative to the largest wanted value.")
 
     @property
-    def worst(self) -> float:
-        """Largest difference between reached and wanted force or friction, N."""
-        return float(np.abs(self._asked[2]).max())
+    def _asked(self) -> tuple[FloatArray, FloatArray]:
+        """The quantity asked for, as wanted and as reached, N."""
+        return (self.wanted, self.force) if self.kind == "force" else (self.wanted_friction, self.friction)
 
-    @property
-    def rms(self) -> float:
-        """Root mean square of the difference between reached and wanted force or friction, N."""
-        return float(np.sqrt(np.mean(self._asked[2] ** 2)))
-
-    @property
-    def worst_share(self) -> float:
-        """`worst` relative to the largest wanted value."""
-        return self.worst / (float(self._asked[0].max()) or math.inf)
-
-    @property
-    def rms_share(self) -> float:
-        """`rms` relative to the largest wanted value."""
-        return self.rms / (float(self._asked[0].max()) or math.inf)
+    @cached_property
+    def _figures(self) -> dict[str, float]:
+        (wanted, reached), miss = self._asked, np.subtract(*self._asked)
+        most, size = float(wanted.max()), {"worst": float(np.abs(miss).max()), "rms": float(np.sqrt(np.mean(miss**2)))}
+        shares = {f"{name}_share": x / (most or math.inf) for name, x in size.items()}
+        return {**size, **shares, "largest_wanted": most, "largest_reached": float(reached.max())}
 
     @property
     def peak(self) -> float:
@@ -256,21 +251,16 @@ class InverseDrive(Sealed, Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The figures as plain data, in SI units."""
-        names = ("carrier", "limit", "slew", "lead", "peak", "at_limit", "worst", "rms", "worst_share", "rms_share")
-        wanted, reached, _ = self._asked
-        return {
-            "kind": self.kind, "rate": self.drive.rate, "samples": self.drive.values.size,
-            **{name: getattr(self, name) for name in names}, "largest_wanted": float(wanted.max()),
-            "largest_reached": float(reached.max()), "corrections": self.corrections,
-        }  # fmt: skip
+        own = {name: getattr(self, name) for name in ("carrier", "limit", "slew", "lead", "peak", "at_limit")}
+        head = {"kind": self.kind, "rate": self.drive.rate, "samples": self.drive.values.size}
+        return {**head, **own, **self._figures, "corrections": self.corrections}
 
     def _page(self) -> Page:
-        wanted, reached, _ = self._asked
         rows = [
             ("peak of the drive", format_si(self.peak, "V")),
             ("samples", f"{self.drive.values.size:,} at {format_si(self.drive.rate, 'Hz')}"),
-            (f"largest {self.kind} wanted", format_si(float(wanted.max()), "N")),
-            (f"largest {self.kind} reached", format_si(float(reached.max()), "N")),
+            (f"largest {self.kind} wanted", format_si(self._figures["largest_wanted"], "N")),
+            (f"largest {self.kind} reached", format_si(self._figures["largest_reached"], "N")),
             ("worst miss", f"{format_si(self.worst, 'N')}, {100.0 * self.worst_share:.2g} %"),
             ("rms miss", f"{format_si(self.rms, 'N')}, {100.0 * self.rms_share:.2g} %"),
             ("time at a limit", f"{100.0 * self.at_limit:.3g} %"),
@@ -289,14 +279,14 @@ class InverseDrive(Sealed, Shown):
     def plot(self) -> drawing.Picture:
         """Picture of the wanted and the reached quantity, their difference, and the drive, against time."""
         figure, (top, middle, bottom) = drawing.new_figure(3, height=5.2, sharex=True, height_ratios=(3, 1.4, 2))
-        (wanted, reached, miss), (at, volts) = self._asked, self.drive.knots
+        (wanted, reached), (at, volts) = self._asked, self.drive.knots
         scale, unit = drawing.engineering(float(at[-1]), "s")
         force, newton = drawing.engineering(float(wanted.max(initial=0.0)) or 1.0, "N")
         small, milli = drawing.engineering(max(self.worst, 1e-12), "N")
         for ax, t, y, color, linewidth, ls, label in (
             (top, self.times, force * wanted, drawing.BLACK, 2.2, "-", "wanted"),
             (top, self.times, force * reached, drawing.ORANGE, 1.2, (0, (4, 1.5)), "reached"),
-            (middle, self.times, small * miss, drawing.VERMILION, 1.0, "-", None),
+            (middle, self.times, small * (reached - wanted), drawing.VERMILION, 1.0, "-", None),
             (bottom, at, volts, drawing.BLUE, 0.9, "-", None),
         ):
             ax.plot(*drawing.thin(scale * t, y), color=color, linewidth=linewidth, ls=ls, label=label)
