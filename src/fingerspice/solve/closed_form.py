@@ -53,19 +53,19 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     tables = Tables(problem, 1e-12 if at_once else 1e-13, no_chirps=not at_once)
     modes = scene.remember(("modes", *area.tolist()), lambda: scene.modes_at(area), MOST_MODES)
     n = modes.rates.size
-    v0, z_end = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before), start.y[n:]
+    v0, z_end, end = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before), start.y[n:], problem.t_stop
     sampled = _at_samples(problem, modes, v0)
     if sampled is not None:
-        rows, last, end = *sampled, problem.t_stop
+        rows, x_end, s_end = sampled
     else:
-        answer, last, end = _answer(problem, tables, None if at_once else modes, v0)
-        rows = answer.x(modes)
+        answer, end = _answer(problem, tables, None if at_once else modes, v0)
+        x, s_end = _along(modes.shape, answer.v) - _along(modes.follow, answer.s), answer.s[-1]
+        rows, x_end = x[:-1], x[-1]
         if problem.charge:
             flow = partial(_loop_charge, problem) if at_once else partial(_charge, problem, area, modes, v0)
-            (z, current, charge_error), (z_last, _, _) = flow(answer), flow(last)
-            rows, z_end = np.hstack([rows, z, current]), z_last[0]
-    y = np.concatenate([last.x(modes)[0], z_end])
-    state = State(end, y, last.s[0], np.zeros(area.size), scene.charge_law)
+            z, current, charge_error = flow(answer)
+            rows, z_end = np.hstack([rows, z[:-1], current[:-1]]), z[-1]
+    state = State(end, np.append(x_end, z_end), s_end, np.zeros(area.size), scene.charge_law)
     status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
     run = Run(problem.t_out[: len(rows)], problem.left[: len(rows)], rows, status, 0, {}, state)
     run.t_failed, run.unseen, run.rough = tables.not_finite, tables.unseen, tables.rough
@@ -79,16 +79,12 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
 
 
 class _Answer(NamedTuple):
-    """Response at n_t times: modes (n_t, n), and the sources, their integrals and their slopes (n_t, n_s)."""
+    """Response at n_t times, the last one the end: modes (n_t, n); sources, their integrals and slopes (n_t, n_s)."""
 
     v: FloatArray
     s: FloatArray
     integral: FloatArray
     slope: FloatArray
-
-    def x(self, modes: Modes) -> FloatArray:
-        """Live voltages, V, shape (n_t, n)."""
-        return _along(modes.shape, self.v) - _along(modes.follow, self.s)
 
 
 def _along(matrix: FloatArray, values: FloatArray) -> FloatArray:
@@ -96,8 +92,8 @@ def _along(matrix: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kj,tj->tk", matrix, values))
 
 
-def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray) -> tuple[_Answer, _Answer, float]:
-    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s."""
+def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray) -> tuple[_Answer, float]:
+    """Response at the outputs reached and, left-hand, at the end of the windows; and that end, s."""
     t_out, left = problem.t_out, problem.left
     n, n_s, size = v0.size, len(problem.network.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
@@ -128,12 +124,11 @@ def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArra
         v[first:size], integral[first:size] = v[size], integral[size]
         s[first:size], slope[first:size] = values_at(after, end)
         first = size
-    out, last = (_Answer(v[part], s[part], integral[part], slope[part]) for part in (slice(first), slice(size, None)))
-    return out, last, end
+    return _Answer(*(x[np.append(np.arange(first), size)] for x in (v, s, integral, slope))), end
 
 
-def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, _Answer] | None:
-    """Live voltages (n_t, n), V, and the response at the end, by a recursion; None for outputs at other times."""
+def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Live voltages (n_t, n), those (n,) and the source at the end, V, by a recursion; None for other outputs."""
     wave, t_out = problem.network.waveform, problem.t_out
     if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
         return None
@@ -143,8 +138,8 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
     u, rates, gains = wave.values[:count], modes.rates, np.ascontiguousarray(modes.gains[:, 0])
     live, end = linear.first_order_hold(u, 1.0 / wave.rate, rates, gains, -modes.follow[:, 0], modes.shape, v0)
-    s = np.array([[float(wave.value(problem.t_stop, "left"))]])
-    return live.T, _Answer(end[None], s, np.zeros((1, 1)), np.zeros((1, 1)))
+    s = np.array([float(wave.value(problem.t_stop, "left"))])
+    return live.T, modes.shape @ end - modes.follow @ s, s
 
 
 def _charge(
