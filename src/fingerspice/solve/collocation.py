@@ -107,16 +107,14 @@ class Track(Stepping):
 
         # Similar runs share a system: there is one for each decade of tolerances, of up to 1 MB.
         self.system, self.area_error = scene.remember(("system", decade, top), make)
-        model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
+        model, shown = self.system.model, scene.shown.turn.size
+        self.rates, self.n_error = self.system.rates, problem.initial.y.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
         self.capacitance = float(model.slow[-3]) * model.area0  # Of the layer through which the charge is computed
         super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown)
-        self.rates, self.error = self.system.rates, np.zeros(n + 1)
-        self.control["branch_length"], self.control["margin"] = np.inf, 1.0
-        self.load(problem.initial)
 
-    def load(self, initial: State) -> None:
-        super().load(initial)
+    def begin(self, initial: State, tol: float) -> None:
+        super().begin(initial, tol)
         began = self.problem.inner if initial is self.problem.initial else to_loop(self.problem.scene, initial)
         (self.y[:], u_gap), self.control["u_before"] = began, initial.s_before[0]
         if self.system.model.mobile and self.sign[0] != 0.0:
@@ -301,15 +299,17 @@ class March(Stepping):
         self.gaps, self.largest = list(scene.network.fingers), u_scale
         self.area_error = max((area_missed(curve, self.decade) for curve in scene.net.curves), default=0.0)
         self.capacitance = float(problem.network.capacitance(scene.net.area0).sum())
+        self.n_error = size - n_s
         super().__init__(problem, tol * u_scale, size - n_s, size + n_s if problem.charge else size)
-        self.control["magnified"] = 1.0
-        self.error = np.zeros(self.n + self.n_slow)
-        self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
         self.shortest = problem.network.waveform.shortest_time()
         self.references = known_references(scene, self.decade)
         self.form = self.references.form()
         self.rates, self.held, cells = self.form.rates, held(self.form), self.form.c.size
         self.work = new_network_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
+
+    def begin(self, initial: State, tol: float) -> None:
+        super().begin(initial, tol)
+        self.control["magnified"] = 1.0
 
     @property
     def rounding(self) -> list[float]:

@@ -275,7 +275,7 @@ class Search(Period):
             if self.one is None:
                 self.one = stepping(self.problem, self.rtol, tol, self.scale, self.top)
             one = self.one
-            one.again(initial, tol * self.scale)
+            one.begin(initial, tol * self.scale)
             try:
                 if one.through(self.sources, self.end) is not Status.SUCCESS:
                     return None
