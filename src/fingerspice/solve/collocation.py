@@ -310,6 +310,7 @@ class March(Stepping):
     def begin(self, initial: State, tol: float) -> None:
         super().begin(initial, tol)
         self.control["magnified"] = 1.0
+        self.branch = np.tile([self.problem.t_start, math.inf], (self.net.gap.size, 1))
 
     @property
     def rounding(self) -> list[float]:

@@ -57,13 +57,14 @@ class Stepping(Integration):
     capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
     charge_safety = 1.0  # Stated error of the charge over the estimate
     rates: FloatArray  # Decay rates of the modes, among them those at 0 V, 1/s
+    branch = np.zeros((0, 2))  # (n_area, 2): As in `ManyAreas`; none for a stack
     looks = loop.no_looks()  # Those of a run that `look` does not prepare
 
     def __init__(self, problem: Problem, tol: float, shown: int, width: int) -> None:
         super().__init__(problem)
         wave, span = problem.network.waveform, problem.t_stop - problem.t_start
         self.period = wave.period or math.inf
-        self.pace = Pace(tol, problem.longest_step(LONGEST_STEP, problem.t_start, problem.t_stop), True, problem.charge)
+        self.longest = problem.longest_step(LONGEST_STEP, problem.t_start, problem.t_stop)
         first, last = (wave.shortest_time(t, t) for t in (problem.t_start, problem.t_stop))
         self.part = math.inf if first == last else span / PARTS
         self.out = np.empty((width, self.t_out.size))  # Output rows as columns
@@ -100,9 +101,8 @@ class Stepping(Integration):
         self.control["t"], self.control["branch_length"], self.control["margin"] = self.problem.t_start, math.inf, 1.0
         self.counters, self.error = np.zeros(readout.N_COUNTERS, np.int64), np.zeros(self.n_error)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
-        self.branch = np.tile([self.problem.t_start, math.inf], (self.net.gap.size, 1))  # As in `ManyAreas`
         self.y[:], self.s_before[:], self.sign[:] = initial.y, initial.s_before, initial.sign
-        self.pace = self.pace._replace(tol=tol)
+        self.pace = Pace(tol, self.longest, True, self.problem.charge)
         self.recorder.parts.clear()
 
     @property
