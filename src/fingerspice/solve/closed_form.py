@@ -59,8 +59,9 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
         rows, x_end, s_end = sampled
     else:
         answer, end = _answer(problem, tables, None if at_once else modes, v0)
-        x, s_end = _along(modes.shape, answer.v) - _along(modes.follow, answer.s), answer.s[-1]
-        rows, x_end = x[:-1], x[-1]
+        v, s, _, _ = answer
+        x = _along(modes.shape, v) - _along(modes.follow, s)
+        rows, x_end, s_end = x[:-1], x[-1], s[-1]
         if problem.charge:
             flow = partial(_loop_charge, problem) if at_once else partial(_charge, problem, area, modes, v0)
             z, current, charge_error = flow(answer)
@@ -78,26 +79,22 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     return run
 
 
-class _Answer(NamedTuple):
-    """Response at n_t times, the last one the end: modes (n_t, n); sources, their integrals and slopes (n_t, n_s)."""
-
-    v: FloatArray
-    s: FloatArray
-    integral: FloatArray
-    slope: FloatArray
-
-
 def _along(matrix: FloatArray, values: FloatArray) -> FloatArray:
     """A matrix times the values at each time; not by BLAS, whose threads cost more and may round otherwise."""
     return np.asarray(np.einsum("kj,tj->tk", matrix, values))
 
 
-def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray) -> tuple[_Answer, float]:
-    """Response at the outputs reached and, left-hand, at the end of the windows; and that end, s."""
+def _answer(
+    problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray
+) -> tuple[list[FloatArray], float]:  # fmt: skip
+    """Modes (n_t, n), and sources, their integrals and slopes (n_t, n_s), at the outputs reached; and an end, s.
+
+    The last row is the left-hand response at the end of the windows.
+    """
     t_out, left = problem.t_out, problem.left
     n, n_s, size = v0.size, len(problem.network.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
-    v, s, integral, slope = (np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s))
+    v, s, integral, slope = found = [np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s)]
     v[:], s[size], end, first = v0, problem.initial.s_before, problem.t_start, 0
     sources = None
     for window in tables:
@@ -124,7 +121,7 @@ def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArra
         v[first:size], integral[first:size] = v[size], integral[size]
         s[first:size], slope[first:size] = values_at(after, end)
         first = size
-    return _Answer(*(x[np.append(np.arange(first), size)] for x in (v, s, integral, slope))), end
+    return [x[np.append(np.arange(first), size)] for x in found], end
 
 
 def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
@@ -143,15 +140,15 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
 
 
 def _charge(
-    problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, answer: _Answer
+    problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, answer: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray, float | None]:
     """Charge (C) and regular current (A) that each source has delivered, both (n_t, n_s), with no error known."""
-    start, by, v, s = problem.initial, by_modes(problem.network, modes, area), answer.v, answer.s
+    start, by, (v, s, given, slope) = problem.initial, by_modes(problem.network, modes, area), answer
     # A mode with rate 0 has no leakage current, so that any value of its integral will do.
-    integral = (_along(modes.gains, answer.integral) - (v - v0)) / np.where(modes.rates > 0.0, modes.rates, np.inf)
+    integral = (_along(modes.gains, given) - (v - v0)) / np.where(modes.rates > 0.0, modes.rates, np.inf)
     moved = _along(by["stored"], v - v0) + _along(by["stored_s"], s - start.s_before)
-    charge = start.y[v0.size :] + moved + _along(by["lost"], integral) + _along(by["lost_s"], answer.integral)
-    moving = _along(by["stored"], _along(modes.gains, s) - modes.rates * v) + _along(by["stored_s"], answer.slope)
+    charge = start.y[v0.size :] + moved + _along(by["lost"], integral) + _along(by["lost_s"], given)
+    moving = _along(by["stored"], _along(modes.gains, s) - modes.rates * v) + _along(by["stored_s"], slope)
     current = moving + _along(by["lost"], v) + _along(by["lost_s"], s)
     return charge, current, None
 
@@ -178,10 +175,10 @@ def _state_errors(problem: Problem, run: Run, bound: float) -> None:
     run.gaps, run.node_error = np.array(gaps), rounding + bound * largest
 
 
-def _loop_charge(problem: Problem, answer: _Answer) -> tuple[FloatArray, FloatArray, float | None]:
+def _loop_charge(problem: Problem, answer: list[FloatArray]) -> tuple[FloatArray, FloatArray, float | None]:
     """Charge (C) and current (A) of a stack without leaks, both (n_t, 1), and the error of the charge, C."""
-    model, (y, _), moved = model_of(problem.scene), problem.inner, np.empty(len(answer.s))
-    u, slope, x_gap, error = answer.s[:, 0].copy(), answer.slope[:, 0], float(dot(model.gap, y)), 0.0
+    model, (y, _), (_, s, _, ds) = model_of(problem.scene), problem.inner, answer
+    u, slope, x_gap, moved, error = s[:, 0].copy(), ds[:, 0], float(dot(model.gap, y)), np.empty(len(s)), 0.0
     u_gap = model.k_gap * u + x_gap
     inverse, bend = inverse_areas_with_slopes(u_gap, model.curve)
     held, current = u / inverse / model.s, slope / inverse / model.s

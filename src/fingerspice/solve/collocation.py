@@ -51,26 +51,20 @@ ATTEMPTS = 6
 GUESS = 1.0  # Voltage scale of a circuit whose sources give none, before any voltage has been computed, V
 
 
-class _Scratch(threading.local):
-    """The present thread's step tables and scratch arrays by number of modes, and the systems that the tables are of.
-
-    Fresh arrays would cost a changed circuit some 50 us of its set-up, as the memory has to be mapped anew.
-    """
-
-    def __init__(self) -> None:
-        self.by_size: dict[int, tuple[StepTables, Work, System]] = {}
-
-    def of(self, system: System) -> tuple[StepTables, Work]:
-        """Tables and arrays for the next call of a compiled loop: another system's run may use them after that."""
-        n = system.model.gap.size
-        tables, work, before = self.by_size.get(n) or (new_tables(n), new_stack_work(n), None)
-        if before is not system:
-            self.by_size[n] = tables, work, system
-            tables.used[:] = 0
-        return tables, work
+# Of the present thread, by number of modes: step tables, scratch arrays, and the system that the tables are of. Fresh
+# arrays would cost a changed circuit some 50 us of its set-up, as the memory has to be mapped anew.
+SCRATCH = threading.local()
 
 
-SCRATCH = _Scratch()
+def scratch_of(system: System) -> tuple[StepTables, Work]:
+    """Tables and arrays for the next call of a compiled loop: another system's run may use them after that."""
+    n = system.model.gap.size
+    kept: dict[Any, tuple[StepTables, Work, System]] = vars(SCRATCH)
+    tables, work, before = kept.get(n) or (new_tables(n), new_stack_work(n), None)
+    if before is not system:
+        kept[n] = tables, work, system
+        tables.used[:] = 0
+    return tables, work
 
 
 def system_of(
@@ -127,7 +121,7 @@ class Track(Stepping):
         return [4e-16 * (peak + self.system.model.k_gap * size), 4e-16 * (peak + size)]
 
     def circuit(self, sources: Sources) -> OneArea:
-        return OneArea(self.system, *SCRATCH.of(self.system), integral_table(), sources)
+        return OneArea(self.system, *scratch_of(self.system), integral_table(), sources)
 
     def failed(self, code: int, sources: Sources) -> Status:
         if code == readout.OUT_OF_RANGE:

@@ -403,11 +403,8 @@ class Search(Period):
         tol = max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL)
         base = self.passed(self.z, tol).end
         slope = np.diag(self.decay)
-        for k in np.flatnonzero(self.rates * self.span < _FORGOTTEN):
-            if not self.free[k]:
-                continue
-            unit = np.zeros(self.z.size)
-            unit[k] = 1.0
+        for k in np.flatnonzero(self.free & (self.rates * self.span < _FORGOTTEN)):
+            unit = np.eye(self.z.size)[k]
             by = _SHIFT * self.scale / max(self._largest(unit), 1e-300)
             slope[:, k] = (self.passed(self.z + by * unit, tol).end - base) / by
         return slope
