@@ -174,7 +174,9 @@ class Known:
     def __init__(self, scene: Scene, decade: int) -> None:
         n_area, (numbers, magnified, self.shapes) = scene.net.area0.size, self._referred(scene, scene.net.area0)
         counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
-        self.arrays = References(np.zeros((2, n_area), np.int64), np.zeros((2, numbers.size)), *counts)
+        room = max(2, min(MOST_REFERENCES, MOST_NUMBERS // numbers.size))
+        # Memory that no reference has been written to yet costs nothing.
+        self.arrays = References(np.empty((room, n_area), np.int64), np.empty((room, numbers.size)), *counts)
         self.tables = new_tables(self.shapes[0][0])
         # (n_area + 1,): Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of
         # the largest voltage; the maximum over all references
@@ -198,9 +200,6 @@ class Known:
     def add(self, scene: Scene, levels: tuple[int, ...]) -> None:
         """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
         arrays, one = self.arrays, int(self.arrays.used[0])
-        if one == len(arrays.levels):
-            more = {"levels": np.zeros_like(arrays.levels), "numbers": np.zeros_like(arrays.numbers)}
-            self.arrays = arrays = arrays._replace(**{k: np.append(getattr(arrays, k), x, 0) for k, x in more.items()})
         area = scene.net.area0 * LEVEL_RATIO ** np.array(levels, float)
         arrays.numbers[one], magnified, _ = self._referred(scene, area)
         arrays.levels[one] = levels
@@ -332,7 +331,7 @@ class March(Stepping):
             # Add the reference areas that the compiled loop needs next, and that it has written to `wanted`.
             scene, known, at = self.problem.scene, self.references, self.work.at
             wanted = tuple(map(int, known.arrays.wanted))
-            if known.arrays.used[0] >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
+            if known.arrays.used[0] == len(known.arrays.levels):
                 # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
                 levels = tuple(map(int, known.arrays.levels[at[0]]))
                 self.references = known = known_references(scene, self.decade, anew=True)

@@ -271,17 +271,14 @@ class Search(Period):
 
     def _stepped(self, initial: State, tol: float) -> _Pass | None:
         """One pass by exponential steps; None where they fail before the end."""
-        while True:
-            if self.one is None:
-                self.one = stepping(self.problem, self.rtol, tol, self.scale, self.top)
-            one = self.one
-            one.begin(initial, tol * self.scale)
-            try:
-                if one.through(self.sources, self.end) is not Status.SUCCESS:
-                    return None
-                break
-            except OutOfRangeError as left:
-                self.top, self.one = 1.5 * left.args[0], None
+        one = self.one = self.one or stepping(self.problem, self.rtol, tol, self.scale, self.top)
+        one.begin(initial, tol * self.scale)
+        try:
+            if one.through(self.sources, self.end) is not Status.SUCCESS:
+                return None
+        except OutOfRangeError as left:
+            self.top, self.one = 1.5 * left.args[0], None
+            return self._stepped(initial, tol)
         n, magnified = self.n, max(1.0, float(one.control["magnified"]))
         if isinstance(one, March):
             error, rounding = np.append(one.form.shape @ one.error[:n], one.error[n:]), one.references.magnified
