@@ -248,13 +248,13 @@ def test_scipys_methods_in_threads_leave_the_warning_filters_as_they_were(monkey
 
 
 def test_nothing_is_left_in_shared_arrays(right: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from fingerspice.solve.collocation import SCRATCH, Track
+    from fingerspice.solve.collocation import Track, scratch_of
 
     march, calls = Track.march, []
 
     def spoilt(self: Track, *arguments: Any) -> int:
         calls.append(1)
-        tables, work = SCRATCH.of(self.system)
+        tables, work = scratch_of(self.system)
         for array in (*work.modal, *(part for part in work if isinstance(part, np.ndarray))):
             array[:] = np.nan
         # Tables of steps may be thrown out at any time.

@@ -53,19 +53,20 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     tables = Tables(problem, 1e-12 if at_once else 1e-13, no_chirps=not at_once)
     modes = scene.remember(("modes", *area.tolist()), lambda: scene.modes_at(area), MOST_MODES)
     n = modes.rates.size
-    v0, z_end = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before), start.y[n:]
+    v0, z_end, end = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before), start.y[n:], problem.t_stop
     sampled = _at_samples(problem, modes, v0)
     if sampled is not None:
-        rows, last, end = *sampled, problem.t_stop
+        rows, x_end, s_end = sampled
     else:
-        answer, last, end = _answer(problem, tables, None if at_once else modes, v0)
-        rows = answer.x(modes)
+        answer, end = _answer(problem, tables, None if at_once else modes, v0)
+        v, s, _, _ = answer
+        x = _along(modes.shape, v) - _along(modes.follow, s)
+        rows, x_end, s_end = x[:-1], x[-1], s[-1]
         if problem.charge:
             flow = partial(_loop_charge, problem) if at_once else partial(_charge, problem, area, modes, v0)
-            (z, current, charge_error), (z_last, _, _) = flow(answer), flow(last)
-            rows, z_end = np.hstack([rows, z, current]), z_last[0]
-    y = np.concatenate([last.x(modes)[0], z_end])
-    state = State(end, y, last.s[0], np.zeros(area.size), scene.charge_law)
+            z, current, charge_error = flow(answer)
+            rows, z_end = np.hstack([rows, z[:-1], current[:-1]]), z[-1]
+    state = State(end, np.append(x_end, z_end), s_end, np.zeros(area.size), scene.charge_law)
     status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
     run = Run(problem.t_out[: len(rows)], problem.left[: len(rows)], rows, status, 0, {}, state)
     run.t_failed, run.unseen, run.rough = tables.not_finite, tables.unseen, tables.rough
@@ -78,30 +79,22 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     return run
 
 
-class _Answer(NamedTuple):
-    """Response at n_t times: modes (n_t, n), and the sources, their integrals and their slopes (n_t, n_s)."""
-
-    v: FloatArray
-    s: FloatArray
-    integral: FloatArray
-    slope: FloatArray
-
-    def x(self, modes: Modes) -> FloatArray:
-        """Live voltages, V, shape (n_t, n)."""
-        return _along(modes.shape, self.v) - _along(modes.follow, self.s)
-
-
 def _along(matrix: FloatArray, values: FloatArray) -> FloatArray:
     """A matrix times the values at each time; not by BLAS, whose threads cost more and may round otherwise."""
     return np.asarray(np.einsum("kj,tj->tk", matrix, values))
 
 
-def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray) -> tuple[_Answer, _Answer, float]:
-    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s."""
+def _answer(
+    problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray
+) -> tuple[list[FloatArray], float]:  # fmt: skip
+    """Modes (n_t, n), and sources, their integrals and slopes (n_t, n_s), at the outputs reached; and an end, s.
+
+    The last row is the left-hand response at the end of the windows.
+    """
     t_out, left = problem.t_out, problem.left
     n, n_s, size = v0.size, len(problem.network.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
-    v, s, integral, slope = (np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s))
+    v, s, integral, slope = found = [np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s)]
     v[:], s[size], end, first = v0, problem.initial.s_before, problem.t_start, 0
     sources = None
     for window in tables:
@@ -128,12 +121,11 @@ def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArra
         v[first:size], integral[first:size] = v[size], integral[size]
         s[first:size], slope[first:size] = values_at(after, end)
         first = size
-    out, last = (_Answer(v[part], s[part], integral[part], slope[part]) for part in (slice(first), slice(size, None)))
-    return out, last, end
+    return [x[np.append(np.arange(first), size)] for x in found], end
 
 
-def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, _Answer] | None:
-    """Live voltages (n_t, n), V, and the response at the end, by a recursion; None for outputs at other times."""
+def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Live voltages (n_t, n), those (n,) and the source at the end, V, by a recursion; None for other outputs."""
     wave, t_out = problem.network.waveform, problem.t_out
     if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
         return None
@@ -143,20 +135,20 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
     u, rates, gains = wave.values[:count], modes.rates, np.ascontiguousarray(modes.gains[:, 0])
     live, end = linear.first_order_hold(u, 1.0 / wave.rate, rates, gains, -modes.follow[:, 0], modes.shape, v0)
-    s = np.array([[float(wave.value(problem.t_stop, "left"))]])
-    return live.T, _Answer(end[None], s, np.zeros((1, 1)), np.zeros((1, 1)))
+    s = np.array([float(wave.value(problem.t_stop, "left"))])
+    return live.T, modes.shape @ end - modes.follow @ s, s
 
 
 def _charge(
-    problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, answer: _Answer
+    problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, answer: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray, float | None]:
     """Charge (C) and regular current (A) that each source has delivered, both (n_t, n_s), with no error known."""
-    start, by, v, s = problem.initial, by_modes(problem.network, modes, area), answer.v, answer.s
+    start, by, (v, s, given, slope) = problem.initial, by_modes(problem.network, modes, area), answer
     # A mode with rate 0 has no leakage current, so that any value of its integral will do.
-    integral = (_along(modes.gains, answer.integral) - (v - v0)) / np.where(modes.rates > 0.0, modes.rates, np.inf)
+    integral = (_along(modes.gains, given) - (v - v0)) / np.where(modes.rates > 0.0, modes.rates, np.inf)
     moved = _along(by["stored"], v - v0) + _along(by["stored_s"], s - start.s_before)
-    charge = start.y[v0.size :] + moved + _along(by["lost"], integral) + _along(by["lost_s"], answer.integral)
-    moving = _along(by["stored"], _along(modes.gains, s) - modes.rates * v) + _along(by["stored_s"], answer.slope)
+    charge = start.y[v0.size :] + moved + _along(by["lost"], integral) + _along(by["lost_s"], given)
+    moving = _along(by["stored"], _along(modes.gains, s) - modes.rates * v) + _along(by["stored_s"], slope)
     current = moving + _along(by["lost"], v) + _along(by["lost_s"], s)
     return charge, current, None
 
@@ -183,10 +175,10 @@ def _state_errors(problem: Problem, run: Run, bound: float) -> None:
     run.gaps, run.node_error = np.array(gaps), rounding + bound * largest
 
 
-def _loop_charge(problem: Problem, answer: _Answer) -> tuple[FloatArray, FloatArray, float | None]:
+def _loop_charge(problem: Problem, answer: list[FloatArray]) -> tuple[FloatArray, FloatArray, float | None]:
     """Charge (C) and current (A) of a stack without leaks, both (n_t, 1), and the error of the charge, C."""
-    model, (y, _), moved = model_of(problem.scene), problem.inner, np.empty(len(answer.s))
-    u, slope, x_gap, error = answer.s[:, 0].copy(), answer.slope[:, 0], float(dot(model.gap, y)), 0.0
+    model, (y, _), (_, s, _, ds) = model_of(problem.scene), problem.inner, answer
+    u, slope, x_gap, moved, error = s[:, 0].copy(), ds[:, 0], float(dot(model.gap, y)), np.empty(len(s)), 0.0
     u_gap = model.k_gap * u + x_gap
     inverse, bend = inverse_areas_with_slopes(u_gap, model.curve)
     held, current = u / inverse / model.s, slope / inverse / model.s

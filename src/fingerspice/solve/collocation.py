@@ -51,26 +51,20 @@ ATTEMPTS = 6
 GUESS = 1.0  # Voltage scale of a circuit whose sources give none, before any voltage has been computed, V
 
 
-class _Scratch(threading.local):
-    """The present thread's step tables and scratch arrays by number of modes, and the systems that the tables are of.
-
-    Fresh arrays would cost a changed circuit some 50 us of its set-up, as the memory has to be mapped anew.
-    """
-
-    def __init__(self) -> None:
-        self.by_size: dict[int, tuple[StepTables, Work, System]] = {}
-
-    def of(self, system: System) -> tuple[StepTables, Work]:
-        """Tables and arrays for the next call of a compiled loop: another system's run may use them after that."""
-        n = system.model.gap.size
-        tables, work, before = self.by_size.get(n) or (new_tables(n), new_stack_work(n), None)
-        if before is not system:
-            self.by_size[n] = tables, work, system
-            tables.used[:] = 0
-        return tables, work
+# Of the present thread, by number of modes: step tables, scratch arrays, and the system that the tables are of. Fresh
+# arrays would cost a changed circuit some 50 us of its set-up, as the memory has to be mapped anew.
+SCRATCH = threading.local()
 
 
-SCRATCH = _Scratch()
+def scratch_of(system: System) -> tuple[StepTables, Work]:
+    """Tables and arrays for the next call of a compiled loop: another system's run may use them after that."""
+    n = system.model.gap.size
+    kept: dict[Any, tuple[StepTables, Work, System]] = vars(SCRATCH)
+    tables, work, before = kept.get(n) or (new_tables(n), new_stack_work(n), None)
+    if before is not system:
+        kept[n] = tables, work, system
+        tables.used[:] = 0
+    return tables, work
 
 
 def system_of(
@@ -107,16 +101,14 @@ class Track(Stepping):
 
         # Similar runs share a system: there is one for each decade of tolerances, of up to 1 MB.
         self.system, self.area_error = scene.remember(("system", decade, top), make)
-        model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
+        model, shown = self.system.model, scene.shown.turn.size
+        self.rates, self.n_error = self.system.rates, problem.initial.y.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
         self.capacitance = float(model.slow[-3]) * model.area0  # Of the layer through which the charge is computed
         super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown)
-        self.rates, self.error = self.system.rates, np.zeros(n + 1)
-        self.control["branch_length"], self.control["margin"] = np.inf, 1.0
-        self.load(problem.initial)
 
-    def load(self, initial: State) -> None:
-        super().load(initial)
+    def begin(self, initial: State, tol: float) -> None:
+        super().begin(initial, tol)
         began = self.problem.inner if initial is self.problem.initial else to_loop(self.problem.scene, initial)
         (self.y[:], u_gap), self.control["u_before"] = began, initial.s_before[0]
         if self.system.model.mobile and self.sign[0] != 0.0:
@@ -129,7 +121,7 @@ class Track(Stepping):
         return [4e-16 * (peak + self.system.model.k_gap * size), 4e-16 * (peak + size)]
 
     def circuit(self, sources: Sources) -> OneArea:
-        return OneArea(self.system, *SCRATCH.of(self.system), integral_table(), sources)
+        return OneArea(self.system, *scratch_of(self.system), integral_table(), sources)
 
     def failed(self, code: int, sources: Sources) -> Status:
         if code == readout.OUT_OF_RANGE:
@@ -182,7 +174,9 @@ class Known:
     def __init__(self, scene: Scene, decade: int) -> None:
         n_area, (numbers, magnified, self.shapes) = scene.net.area0.size, self._referred(scene, scene.net.area0)
         counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
-        self.arrays = References(np.zeros((2, n_area), np.int64), np.zeros((2, numbers.size)), *counts)
+        room = max(2, min(MOST_REFERENCES, MOST_NUMBERS // numbers.size))
+        # Memory that no reference has been written to yet costs nothing.
+        self.arrays = References(np.empty((room, n_area), np.int64), np.empty((room, numbers.size)), *counts)
         self.tables = new_tables(self.shapes[0][0])
         # (n_area + 1,): Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of
         # the largest voltage; the maximum over all references
@@ -206,9 +200,6 @@ class Known:
     def add(self, scene: Scene, levels: tuple[int, ...]) -> None:
         """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
         arrays, one = self.arrays, int(self.arrays.used[0])
-        if one == len(arrays.levels):
-            more = {"levels": np.zeros_like(arrays.levels), "numbers": np.zeros_like(arrays.numbers)}
-            self.arrays = arrays = arrays._replace(**{k: np.append(getattr(arrays, k), x, 0) for k, x in more.items()})
         area = scene.net.area0 * LEVEL_RATIO ** np.array(levels, float)
         arrays.numbers[one], magnified, _ = self._referred(scene, area)
         arrays.levels[one] = levels
@@ -301,15 +292,18 @@ class March(Stepping):
         self.gaps, self.largest = list(scene.network.fingers), u_scale
         self.area_error = max((area_missed(curve, self.decade) for curve in scene.net.curves), default=0.0)
         self.capacitance = float(problem.network.capacitance(scene.net.area0).sum())
+        self.n_error = size - n_s
         super().__init__(problem, tol * u_scale, size - n_s, size + n_s if problem.charge else size)
-        self.control["magnified"] = 1.0
-        self.error = np.zeros(self.n + self.n_slow)
-        self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
         self.shortest = problem.network.waveform.shortest_time()
         self.references = known_references(scene, self.decade)
         self.form = self.references.form()
         self.rates, self.held, cells = self.form.rates, held(self.form), self.form.c.size
         self.work = new_network_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
+
+    def begin(self, initial: State, tol: float) -> None:
+        super().begin(initial, tol)
+        self.control["magnified"] = 1.0
+        self.branch = np.tile([self.problem.t_start, math.inf], (self.net.gap.size, 1))
 
     @property
     def rounding(self) -> list[float]:
@@ -337,7 +331,7 @@ class March(Stepping):
             # Add the reference areas that the compiled loop needs next, and that it has written to `wanted`.
             scene, known, at = self.problem.scene, self.references, self.work.at
             wanted = tuple(map(int, known.arrays.wanted))
-            if known.arrays.used[0] >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
+            if known.arrays.used[0] == len(known.arrays.levels):
                 # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
                 levels = tuple(map(int, known.arrays.levels[at[0]]))
                 self.references = known = known_references(scene, self.decade, anew=True)

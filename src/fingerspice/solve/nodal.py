@@ -62,7 +62,7 @@ class Collocation(Integration):
     ) -> None:
         super().__init__(problem)
         self.scheme, self.tol, self.progress = scheme, tol, progress
-        self.rows = np.full((self.t_out.size, self.width), np.nan)
+        self.rows = np.full((self.t_out.size, self.y.size + problem.charge * self.s_before.size), np.nan)
         least = problem.scene.net.area0.copy()
         for i, contact in enumerate(problem.network.contacts):
             if contact is not None and self.net.gap[i] >= 0:

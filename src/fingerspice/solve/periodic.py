@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +27,7 @@ from fingerspice.solve.problem import Problem, joined
 from fingerspice.solve.runs import no_period
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
 from fingerspice.waveforms.sampling import source_table
-from fingerspice.waveforms.waveform import OFF
+from fingerspice.waveforms.waveform import OFF, Waveform
 
 # Number of equidistant times of a period from which the mean of an area with a time constant is computed.
 SAMPLES = 64
@@ -57,7 +56,18 @@ CHARGING = "a current source charges, from period to period, what nothing drains
 
 
 class Period:
-    """One period of a problem, or only its first half if the second half is the first with opposite sign."""
+    """One period of a problem, or only its first half if the second half is the first with opposite sign.
+
+    `close` finds its periodic state.
+    """
+
+    start: FloatArray  # (n + n_slow,): Live voltages just before the period, V, and relative areas
+    defect: float  # Largest change of a live voltage over a further period, V
+    gap_errors: FloatArray  # (n_gap, 2): Error of the state, as its effect on every gap's voltage and force, V and N
+    periods: float = 1  # Number of periods integrated
+    # Error of the periodic state relative to the error of one period: a slow mode accumulates the errors of the periods
+    # within its memory
+    memory = 1.0
 
     def __init__(self, problem: Problem) -> None:
         waveform, scene, net = problem.network.waveform, problem.scene, problem.scene.net
@@ -79,7 +89,9 @@ class Period:
         self.kept = np.where(self.neutral[:n], kept, 0.0)
         pushed = np.any(self.modes.gains[self.neutral[:n]] != 0.0)
         # The integrated span is one of so many parts of the period; its length, s.
-        self.parts = 2 if _turns(problem) and not pushed and not np.any(self.kept) else 1
+        self.parts = (
+            2 if _turns(problem.network.waveforms, waveform.period) and not pushed and not np.any(self.kept) else 1
+        )
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
         key = "period", self.begin, self.span, problem.step if waveform.is_sampled else 0.0
@@ -148,46 +160,27 @@ class Period:
             raise no_period(self.problem, Status.NOT_PERIODIC, cause=CHARGING)
         return start, end, along
 
-    def close(self) -> Found:
-        """The periodic state of a circuit with fixed areas."""
+    def close(self) -> None:
+        """Find the periodic state of a circuit with fixed areas."""
         start, end, _ = self.linear_state([])
         defect = float(np.abs(self.modes.shape @ (self.turned[: self.n] * end - start)).max(initial=0.0))
-        slope = np.diag(np.exp(-self.rates * self.span * self.parts))
+        self.start, self.defect = self.voltages(start + self.kept), self.parts * defect
         # The only error of the closed form is round-off, which the run adds to its stated error itself.
-        none = np.zeros((len(self.problem.network.fingers), 2))
-        return Found(self.voltages(start + self.kept), self.parts * defect, slope.copy, 1.0, none, 1)
+        self.gap_errors = np.zeros((len(self.problem.network.fingers), 2))
+
+    def map_slope(self) -> FloatArray:
+        """The Jacobian matrix of the period map, to about 1e-5, by the modes and the areas with a time constant."""
+        return np.diag(np.exp(-self.rates * self.span * self.parts))
 
 
-def _turns(problem: Problem) -> bool:
+def _turns(waves: tuple[Waveform, ...], period: float) -> bool:
     """Whether the second half period of every source is the first with opposite sign; then so are all voltages.
 
     The circuit itself has this symmetry: it is linear except for the areas, which depend on the modulus of a voltage.
     """
-    period = problem.network.waveform.period
-    for wave in problem.network.waveforms:
-        if wave == OFF:
-            continue
-        if not wave.half_wave or wave.period is None or period is None:
-            return False
-        ratio = period / wave.period
-        if round(ratio) % 2 == 0 or abs(ratio - round(ratio)) > 1e-9:
-            return False
-    return True
-
-
-class Found(NamedTuple):
-    """A periodic state."""
-
-    start: FloatArray  # (n + n_slow,): Live voltages just before the period, V, and relative areas
-    defect: float  # Largest change of a live voltage over a further period, V
-    # Gives the Jacobian matrix of the period map, (n + n_slow, n + n_slow), to about 1e-5; its variables are the modes
-    # and the areas with a time constant
-    map_slope: Callable[[], FloatArray]
-    # Error of the periodic state relative to the error of one period: a slow mode accumulates the errors of the periods
-    # within its memory
-    memory: float
-    gap_errors: FloatArray  # (n_gap, 2): Error of the state, as its effect on every gap's voltage and force, V and N
-    periods: float  # Number of periods integrated
+    # How often a source repeats itself in the period; 0 for one that does not turn in half of its own.
+    counts = [period / wave.period if wave.half_wave and wave.period else 0.0 for wave in waves if wave != OFF]
+    return all(round(count) % 2 == 1 and abs(count - round(count)) <= 1e-9 for count in counts)
 
 
 class _Pass(NamedTuple):
@@ -278,17 +271,14 @@ class Search(Period):
 
     def _stepped(self, initial: State, tol: float) -> _Pass | None:
         """One pass by exponential steps; None where they fail before the end."""
-        while True:
-            if self.one is None:
-                self.one = stepping(self.problem, self.rtol, tol, self.scale, self.top)
-            one = self.one
-            one.again(initial, tol * self.scale)
-            try:
-                if one.through(self.sources, self.end) is not Status.SUCCESS:
-                    return None
-                break
-            except OutOfRangeError as left:
-                self.top, self.one = 1.5 * left.args[0], None
+        one = self.one = self.one or stepping(self.problem, self.rtol, tol, self.scale, self.top)
+        one.begin(initial, tol * self.scale)
+        try:
+            if one.through(self.sources, self.end) is not Status.SUCCESS:
+                return None
+        except OutOfRangeError as left:
+            self.top, self.one = 1.5 * left.args[0], None
+            return self._stepped(initial, tol)
         n, magnified = self.n, max(1.0, float(one.control["magnified"]))
         if isinstance(one, March):
             error, rounding = np.append(one.form.shape @ one.error[:n], one.error[n:]), one.references.magnified
@@ -309,12 +299,12 @@ class Search(Period):
         rounding = (np.abs(self.gap[:, : self.n]) @ np.abs(self.modes.inverse)).sum(axis=1)
         return _Pass(one.y, one.s_before, error, one.met, 1.0, 10.0 + rounding)
 
-    def close(self) -> Found:
-        """The periodic state, to `rtol` or as far as round-off permits."""
+    def close(self) -> None:
+        """Find the periodic state, to `rtol` or as far as round-off permits."""
         tol = LOCAL_SHARE * self.rtol
         while True:
             last, step, defect = self._newton(tol)
-            errors, excess, rounding = self._errors(last, step)
+            self.gap_errors, excess, rounding = self._errors(last, step)
             if excess <= 1.0:
                 break
             if excess > 2.0 * rounding and tol > FINEST:
@@ -325,10 +315,10 @@ class Search(Period):
             else:
                 break
         # Its records are views of its arrays, which a copy of what is found would separate.
-        self.one, start = None, np.append(self.voltages(self.z), self.z[self.n :])
-        return Found(start, self.parts * defect, self._map_slope, self.memory, errors, self.passes / self.parts)
+        self.one, self.start = None, np.append(self.voltages(self.z), self.z[self.n :])
+        self.defect, self.periods = self.parts * defect, self.passes / self.parts
 
-    def _map_slope(self) -> FloatArray:
+    def map_slope(self) -> FloatArray:
         slope = self._slope()
         return slope @ slope if self.parts == 2 else slope
 
@@ -410,11 +400,8 @@ class Search(Period):
         tol = max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL)
         base = self.passed(self.z, tol).end
         slope = np.diag(self.decay)
-        for k in np.flatnonzero(self.rates * self.span < _FORGOTTEN):
-            if not self.free[k]:
-                continue
-            unit = np.zeros(self.z.size)
-            unit[k] = 1.0
+        for k in np.flatnonzero(self.free & (self.rates * self.span < _FORGOTTEN)):
+            unit = np.eye(self.z.size)[k]
             by = _SHIFT * self.scale / max(self._largest(unit), 1e-300)
             slope[:, k] = (self.passed(self.z + by * unit, tol).end - base) / by
         return slope
@@ -446,7 +433,7 @@ class Search(Period):
         return np.column_stack([u_error, f_error]), float(over.max(initial=0.0)) / self.rtol, rounding / self.rtol
 
 
-def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
+def close_period(problem: Problem, rtol: float) -> tuple[Problem, Period]:
     """A problem, with its length, that starts from its periodic state, when the source has become periodic.
 
     `rtol` bounds the error of the state alone, relative to the peaks over the period; where round-off exceeds it, the
@@ -456,10 +443,10 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
     if problem.network.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
     period = Search(problem, rtol) if problem.scene.coupled else Period(problem)
-    found, moved = period.close(), period.begin - problem.t_start
-    y = np.append(found.start, np.zeros(period.before.size))
+    period.close()
+    y, moved = np.append(period.start, np.zeros(period.before.size)), period.begin - problem.t_start
     started = dataclasses.replace(
         problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved,
-        initial=dataclasses.replace(period.problem.initial, y=y), begun=found.gap_errors,
+        initial=dataclasses.replace(period.problem.initial, y=y), begun=period.gap_errors,
     )  # fmt: skip
-    return started, found
+    return started, period

@@ -131,7 +131,6 @@ class Integration(ABC):
         self.y, self.sign = problem.initial.y.copy(), problem.initial.sign.copy()
         self.s_before = problem.initial.s_before.copy()
         self.n_slow = self.y.size - self.n - n_s
-        self.width = self.y.size + (n_s if problem.charge else 0)
         self.tried = np.zeros((TRIED, 4))  # The last attempted steps, see `last_tried`
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -50,35 +49,29 @@ class OutOfRangeError(Exception):
 class Stepping(Integration):
     """One integration by exponential steps, with an error of at most `tol` (V) in each step."""
 
-    error: FloatArray  # As in `LoopState`, as `peaks` and `collected`
+    n_error: int  # Size of `LoopState.error`
     gaps: list[int]  # Rows of `peaks` of the gaps whose errors are stated
     largest: float  # Voltage (V) beside the peaks that the round-off of the charge goes with
     area_error: float  # Relative error of the areas' polynomials
     capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
     charge_safety = 1.0  # Stated error of the charge over the estimate
     rates: FloatArray  # Decay rates of the modes, among them those at 0 V, 1/s
+    branch = np.zeros((0, 2))  # (n_area, 2): As in `ManyAreas`; none for a stack
     looks = loop.no_looks()  # Those of a run that `look` does not prepare
-    fresh: list[Any] | None = None  # What an integration that begins `again` sets its arrays to
 
     def __init__(self, problem: Problem, tol: float, shown: int, width: int) -> None:
-        self.controls = np.zeros(1, readout.CONTROL)
-        self.control = self.controls[0]
-        self.control["t"] = problem.t_start
         super().__init__(problem)
         wave, span = problem.network.waveform, problem.t_stop - problem.t_start
         self.period = wave.period or math.inf
-        self.pace = Pace(tol, problem.longest_step(LONGEST_STEP, problem.t_start, problem.t_stop), True, problem.charge)
+        self.longest = problem.longest_step(LONGEST_STEP, problem.t_start, problem.t_stop)
         first, last = (wave.shortest_time(t, t) for t in (problem.t_start, problem.t_stop))
         self.part = math.inf if first == last else span / PARTS
-        self.counters = np.zeros(readout.N_COUNTERS, np.int64)
-        self.step = np.zeros(1, readout.STEP)
-        self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
-        self.branch = np.zeros((0, 2))  # (n, 2): As in `ManyAreas`
         self.out = np.empty((width, self.t_out.size))  # Output rows as columns
         self.rows = self.out.T
         self.outputs = Outputs(self.t_out, self.left, self.out)
         self.repeated = 0  # Number of periods that were not integrated but repeat another
         self.recorder = Recorder(shown)
+        self.begin(problem.initial, tol)
         self.keep(0)
 
     def look(self, asked: float, repeat: bool) -> None:
@@ -100,19 +93,16 @@ class Stepping(Integration):
         scale[self.n :] = self.largest
         self.looks = Looks(values, np.zeros(scale.size), scale)
 
-    def again(self, initial: State, tol: float) -> None:
-        """Go back to the start, with another initial state and another error of a step (V)."""
-        moved = self.controls, self.counters, self.step, self.peaks, self.collected, self.error, self.branch
-        self.fresh = self.fresh or [array.copy() for array in moved]
-        for array, first in zip(moved, self.fresh, strict=True):
-            array[:] = first
-        self.load(initial)
-        self.pace = self.pace._replace(tol=tol)
-        self.recorder.parts.clear()
-
-    def load(self, initial: State) -> None:
-        """Take an initial state."""
+    def begin(self, initial: State, tol: float) -> None:
+        """Go to the start, with an initial state and an error of a step (V)."""
+        self.controls, self.step = np.zeros(1, readout.CONTROL), np.zeros(1, readout.STEP)
+        self.control = self.controls[0]
+        self.control["t"], self.control["branch_length"], self.control["margin"] = self.problem.t_start, math.inf, 1.0
+        self.counters, self.error = np.zeros(readout.N_COUNTERS, np.int64), np.zeros(self.n_error)
+        self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
         self.y[:], self.s_before[:], self.sign[:] = initial.y, initial.s_before, initial.sign
+        self.pace = Pace(tol, self.longest, True, self.problem.charge)
+        self.recorder.parts.clear()
 
     @property
     def t(self) -> float:
