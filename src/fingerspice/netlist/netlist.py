@@ -124,12 +124,10 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
     SPICE's defaults come from the circuit's .tran, and file names are relative to the working directory. Without
     `files`, for a text from elsewhere, no file is read.
     """
-    tran = circuit.tran
-    line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
-    context, notes = Context(tran, in_deck=False, anywhere=files), list[str]()
+    context, notes = Context(circuit.tran, in_deck=False, anywhere=files), list[str]()
     try:
-        deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
-        refuse(len(deck.statements) != 1, "not one source; allowed: such as SQUARE(200 100)")
+        deck = parse_deck(f"source\nVsource a 0 {text}\n")
+        refuse(len(deck.statements) != 1 or deck.directives, "not one source; allowed: such as SQUARE(200 100)")
         waveform, ac = read_source(deck.statements[0]._replace(name="source"), context, notes)
         refuse(ac is not None, "AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
     except InputError as error:
