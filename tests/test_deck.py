@@ -140,7 +140,7 @@ def test_subcircuits_are_flattened_with_their_parameters_and_nodes() -> None:
     assert value(layer.params["d"]) == pytest.approx(3e-6)
     assert value(middle.body[0]) == pytest.approx(6e-6)
     assert value(first.body[0]) == pytest.approx(12e-6)
-    assert list(read.named(".ic")[0].params) == ["v(xf.mid)"]
+    assert list(read.directives[".ic"][0].params) == ["v(xf.mid)"]
 
 
 def test_a_native_device_wins_over_a_definition_of_its_name() -> None:

@@ -189,16 +189,19 @@ def _incidence(branches: list[Element]) -> dict[str, list[Element]]:
     return at
 
 
-def _ways(branches: list[Element], start: str) -> dict[str, Element | None]:
-    """The element by which one gets to each node that is connected to the start."""
-    at, ahead = _incidence(branches), [start]
-    came: dict[str, Element | None] = {start: None}
+def _ways(branches: Iterable[tuple[str, ...]], start: str) -> dict[str, tuple[int, str]]:
+    """Of each node connected to the start: the number of the branch by which one gets there, and the node before it."""
+    at: dict[str, list[tuple[int, str]]] = defaultdict(list)
+    for number, (p, n, *_) in enumerate(branches):
+        at[p].append((number, n))
+        at[n].append((number, p))
+    came, ahead = {start: (0, start)}, [start]
     while ahead:
-        for element in at.get(ahead.pop(), ()):
-            for node in element.nodes[:2]:
-                if node not in came:
-                    came[node] = element
-                    ahead.append(node)
+        before = ahead.pop()
+        for number, node in at[before]:
+            if node not in came:
+                came[node] = number, before
+                ahead.append(node)
     return came
 
 
@@ -207,32 +210,25 @@ def spanning_tree(branches: Iterable[tuple[str, ...]]) -> tuple[list[bool], dict
 
     With it goes each node's voltage against ground, as a row of coefficients of the tree's voltages.
     """
-    above, taken, count = dict[str, str](), list[bool](), 0
-    # Of each node its branches: the other node, the branch's number, and the sign of its voltage from here
-    at: dict[str, list[tuple[str, int, float]]] = defaultdict(list)
+    above, taken, tree = dict[str, str](), list[bool](), list[tuple[str, ...]]()
 
     def root(node: str) -> str:
         while (up := above.setdefault(node, node)) != node:
             above[node] = node = above[up]
         return node
 
-    for p, n, *_ in branches:
-        ends = root(p), root(n)
-        taken.append(ends[0] != ends[1])
-        if taken[-1]:
-            above[ends[0]] = ends[1]
-            at[p].append((n, count, -1.0))
-            at[n].append((p, count, 1.0))
-            count += 1
-    out, todo = {"0": np.zeros(count)}, ["0"]
-    while todo:
-        node = todo.pop()
-        for other, number, sign in at[node]:
-            if other not in out:
-                out[other] = out[node].copy()
-                out[other][number] = sign
-                todo.append(other)
-    return taken, {node: out[node] for node in at if node in out}
+    for branch in branches:
+        p, n = map(root, branch[:2])
+        taken.append(p != n)
+        if p != n:
+            above[p] = n
+            tree.append(branch[:2])
+    rows = {"0": np.zeros(len(tree))}
+    for node, (number, before) in _ways(tree, "0").items():
+        if node != before:
+            rows[node] = rows[before].copy()
+            rows[node][number] = 1.0 if node == tree[number][0] else -1.0
+    return taken, {node: rows[node] for ends in tree for node in ends if node in rows}
 
 
 def _refuse_unsolvable(branches: list[Element]) -> None:
@@ -254,21 +250,21 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
             alone = f"node {named(node, e)} is floating: only {e.name} touches it"
             raise InputError(f"{alone}; allowed: two or more elements at every node{hint}", e.where)
     refuse("0" not in at, "no element touches ground; allowed: one node must be 0 (or gnd)")
-    reached = _ways(branches, "0")
+    reached = _ways((e.nodes for e in branches), "0")
     for node, (e, *_) in at.items():
         refuse(node not in reached, f"node {named(node, e)} ({e.name}) is floating: nothing connects it to ground", e)
     voltages = [e for e in branches if e.device == "V"]
     taken, _ = spanning_tree(e.nodes for e in voltages)
     if not all(taken):
         # The sources before form no loop: there is one way through them from one end to the other.
-        e = voltages[taken.index(False)]
-        came, names, node = _ways(voltages[: taken.index(False)], e.nodes[0]), list[str](), e.nodes[1]
-        while (step := came[node]) is not None:
-            names.append(step.name)
-            node = step.nodes[0] if step.nodes[1] == node else step.nodes[1]
+        *before, e = voltages[: taken.index(False) + 1]
+        came, names, node = _ways((b.nodes for b in before), e.nodes[0]), list[str](), e.nodes[1]
+        while node != e.nodes[0]:
+            number, node = came[node]
+            names.append(before[number].name)
         refuse(len(names) == 1, f"{names[0]} and {e.name} are voltage sources in parallel", e)
         raise InputError(f"{e.name} closes a loop of voltage sources with {', '.join(names)}", e.where)
-    reached = _ways([e for e in branches if e.device != "I"], "0")
+    reached = _ways((e.nodes for e in branches if e.device != "I"), "0")
     for source, node in ((e, node) for e in branches if e.device == "I" for node in e.nodes[:2]):
         if node not in reached:
             where = f"node {named(node, source)} is reached through current sources only"

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
-from fingerspice.netlist.expressions import Bare, Number, Scope, Value
+from fingerspice.netlist.expressions import Bare, Call, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
-from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, OTHERS, Deck, Directive, Statement, Subcircuit
+from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, OTHERS, Deck, Statement, Subcircuit
 from fingerspice.waveforms.waveform import refuse
 
 LONGEST_TITLE = 200  #: Characters of a title that are shown; the middle of a longer title is left out.
@@ -108,7 +108,7 @@ class _Instance:
                 flat = f"v({self.node(key[2:-1].strip())[0]})" if probe else key
                 refuse(flat in params, f".ic gives node {flat[2:-1]!r} twice", value.key)
                 params[flat] = value
-            self.deck.directives.append(Directive(name, args, params, line.where(), line.text))
+            self.deck.directives[name].append(Call(name, args, params, line.where(), line.text))
 
     def _element(self, line: Line) -> None:
         lexemes = lex(line) or [Lexeme("", ",", 0, line)]  # a line of commas has none

@@ -323,12 +323,13 @@ Value: TypeAlias = Number | Token
 
 
 class Call(NamedTuple):
-    """A word with arguments in brackets: `SIN(0 200 100)` or `SIN (0 200 100)`."""
+    """A word with arguments in brackets, `SIN(0 200 100)` or `SIN (0 200 100)`; or a directive, `.tran 1u 1m`."""
 
-    text: str  # The word
-    args: tuple[Value, ...]
-    params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
+    text: str  # The word; the directive's name in lower case, with its dot
+    args: tuple[Word, ...]  # Of a word only numbers and tokens
+    params: dict[str, Value]  # By key in lower case; `.ic v(area)=1` has the key ``v(area)`` of the flat circuit
     where: Where
+    line: str = ""  # That of a directive as written, continuations joined
 
 
 Word: TypeAlias = Number | Token | Call

@@ -19,7 +19,7 @@ from fingerspice.circuit.network import checked
 from fingerspice.netlist.deck import parse_deck, with_comma
 from fingerspice.netlist.expressions import Call, Number, Token, Value, number
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
-from fingerspice.netlist.reader import MAX_WARNINGS, OTHERS, Context, Deck, Directive, Statement, text_of
+from fingerspice.netlist.reader import MAX_WARNINGS, OTHERS, Context, Deck, Statement, text_of
 from fingerspice.netlist.sources import read_source
 from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
 
@@ -82,17 +82,17 @@ def _circuit(deck: Deck) -> Circuit:
 
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:
-    tran = next((read_tran(directive, notes) for directive in deck.named(".tran")), None)
+    tran = next((read_tran(directive, notes) for directive in deck.directives[".tran"]), None)
     context = Context(tran, None if deck.path is None else deck.path.parent)
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
-    work, unused = read_options(deck.named(".options"))
-    initial, unused_starts = read_start(deck.named(".ic"), elements, tran is None or tran.uic)
+    work, unused = read_options(deck.directives[".options"])
+    initial, unused_starts = read_start(deck.directives[".ic"], elements, tran is None or tran.uic)
     notes.extend(_unusual(deck, elements, tran, initial))
     more = len(notes) - MAX_WARNINGS
     if more > 1:
         notes[MAX_WARNINGS:] = [f"{more} more warnings are not shown"]
     laws = {"mobile" if "mobile" in name.lower() else "local" for name in deck.libraries}
-    ac = next(map(read_ac, deck.named(".ac")), None)
+    ac = next(map(read_ac, deck.directives[".ac"]), None)
     refuse(len(laws) > 1, "both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
     law, said, effectless = next(iter(laws), None), tuple(notes), (*deck.unused, *unused, *unused_starts)
     return checked(Circuit(deck.title, elements, tran, ac, initial, law, work, said, effectless, deck.text, deck.path))
@@ -113,7 +113,7 @@ def _unusual(deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initi
         # A source whose frequency is unusual has a warning already.
         if tran is not None and period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
             step, longest = format_si(tran.step, "s"), format_si(period, "s")
-            place = str(deck.named(".tran")[0].where)
+            place = str(deck.directives[".tran"][0].where)
             note = f"{place}: {e.name}: TSTEP is {step}, longer than this source's period of {longest}"
             yield f"{note}: the outputs do not show its course, and the figures of a run still do"
 
@@ -124,12 +124,10 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
     SPICE's defaults come from the circuit's .tran, and file names are relative to the working directory. Without
     `files`, for a text from elsewhere, no file is read.
     """
-    tran = circuit.tran
-    line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
-    context, notes = Context(tran, in_deck=False, anywhere=files), list[str]()
+    context, notes = Context(circuit.tran, in_deck=False, anywhere=files), list[str]()
     try:
-        deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
-        refuse(len(deck.statements) != 1, "not one source; allowed: such as SQUARE(200 100)")
+        deck = parse_deck(f"source\nVsource a 0 {text}\n")
+        refuse(len(deck.statements) != 1 or deck.directives, "not one source; allowed: such as SQUARE(200 100)")
         waveform, ac = read_source(deck.statements[0]._replace(name="source"), context, notes)
         refuse(ac is not None, "AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
     except InputError as error:
@@ -144,7 +142,7 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
 def sweep_from_text(text: str) -> AcSweep:
     """A sweep from text such as ``dec 10 10 100k``."""
     try:
-        sweeps = parse_deck(f"sweep\n.ac {text}\n").named(".ac")
+        sweeps = parse_deck(f"sweep\n.ac {text}\n").directives[".ac"]
         refuse(not sweeps, "not a sweep")
         return read_ac(sweeps[0])
     except InputError as error:
@@ -253,17 +251,17 @@ def _doubts(given: Number, spec: ParameterSpec) -> Iterator[tuple[Where, str]]:
         yield given.where, f"{given.text} is {given.value:g}: exponent and scale both count"
 
 
-def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]:
+def _numbers(directive: Call, usage: str) -> tuple[list[Number], list[str]]:
     """The numbers and the other words of a directive's line."""
     for arg in directive.args:
-        refuse(isinstance(arg, Call), f"{directive.name}: {arg.text!r} is not understood; allowed: {usage}", arg)
+        refuse(isinstance(arg, Call), f"{directive.text}: {arg.text!r} is not understood; allowed: {usage}", arg)
     for key, value in directive.params.items():
-        raise InputError(f"{directive.name} takes no {key!r}; allowed: {usage}", value.key)
+        raise InputError(f"{directive.text} takes no {key!r}; allowed: {usage}", value.key)
     numbers = [arg for arg in directive.args if isinstance(arg, Number)]
     return numbers, [arg.text.lower() for arg in directive.args if isinstance(arg, Token)]
 
 
-def read_tran(directive: Directive, notes: list[str]) -> Tran:
+def read_tran(directive: Call, notes: list[str]) -> Tran:
     """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``; LTspice's may lack TSTEP, of which `notes` gets a warning."""
     usage = ".tran TSTEP TSTOP [TSTART [TMAX]] [uic]"
     numbers, words = _numbers(directive, usage)
@@ -271,7 +269,7 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
         if word in OTHERS["tran"]:
             raise InputError(f".tran {word}: {OTHERS['tran'][word]}", directive.where)
     apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
-    problem = f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}"
+    problem = f"{directive.line.strip()!r} is not understood; allowed: {usage}{apart}"
     refuse(any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4, problem, directive)
     step, stop, start, longest = [None, numbers[0], None, None] if len(numbers) == 1 else [*numbers, None, None][:4]
     assert stop is not None
@@ -283,7 +281,7 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
     if step is None:
         every = stop.value / LTSPICE_OUTPUTS
         step = Number(every, f"{every:g}", directive.where)
-        note = f"{directive.where}: {directive.text.strip()!r} has no TSTEP, which LTspice does not need"
+        note = f"{directive.where}: {directive.line.strip()!r} has no TSTEP, which LTspice does not need"
         notes.append(f"{note}: {LTSPICE_OUTPUTS:,} outputs, one every {every:g} s")
     _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
     _require(1e-30 <= step.value <= 1e30, "TSTEP", step, "1e-30 to 1e30 s")
@@ -298,12 +296,12 @@ def _require(condition: bool, what: str, given: Number | None, allowed: str) -> 
     refuse(not condition, f"{what} is {given and given.text}; allowed: {allowed}", given)
 
 
-def read_ac(directive: Directive) -> AcSweep:
+def read_ac(directive: Call) -> AcSweep:
     """``.ac DEC|OCT|LIN N FSTART FSTOP``."""
     usage = ".ac DEC|OCT|LIN N FSTART FSTOP"
     numbers, words = _numbers(directive, usage)
     if len(words) != 1 or words[0] not in ("dec", "oct", "lin") or len(numbers) != 3:
-        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}", directive.where)
+        raise InputError(f"{directive.line.strip()!r} is not understood; allowed: {usage}", directive.where)
     scale, (n, low, high) = words[0], numbers
     _require(n.value >= 1 and n.value == int(n.value) and n.value <= 1e6, "N", n, "a whole number, 1 to 1e6")
     _require(low.value > 0.0, "FSTART", low, "more than 0 Hz")
@@ -315,7 +313,7 @@ def read_ac(directive: Directive) -> AcSweep:
     return AcSweep(scale, int(n.value), low.value, high.value)
 
 
-def read_start(given: list[Directive], elements: tuple[Element, ...], uic: bool) -> tuple[dict[str, float], list[str]]:
+def read_start(given: list[Call], elements: tuple[Element, ...], uic: bool) -> tuple[dict[str, float], list[str]]:
     """``.ic v(node)=value``: start values by canonical node, in V, or in mm^2 of an area node, and what has no effect.
 
     Without effect are with ``uic`` those where no layer or capacitor without ``IC=`` is, else every ``IC=``.
@@ -326,7 +324,7 @@ def read_start(given: list[Directive], elements: tuple[Element, ...], uic: bool)
     area_nodes = {e.nodes[2] for e in layers}
     out: dict[str, float] = {}
     for directive in given:
-        refuse(directive.args, f"{directive.text.strip()!r} is not understood; {usage}", directive)
+        refuse(directive.args, f"{directive.line.strip()!r} is not understood; {usage}", directive)
         for key, value in directive.params.items():
             place = value.key
             refuse(not (key.startswith("v(") and key.endswith(")")), f".ic {key!r} is not understood; {usage}", place)
@@ -355,7 +353,7 @@ def start_volts(what: str, word: Value) -> float:
     return value
 
 
-def read_options(directives: list[Directive]) -> tuple[str, tuple[str, ...]]:
+def read_options(directives: list[Call]) -> tuple[str, tuple[str, ...]]:
     """The reading of Eq. 7 that ``work`` selects, and the names of ngspice's and LTspice's options, without effect."""
     work, unused = None, []
     for directive in directives:

@@ -9,6 +9,7 @@ import codecs
 import re
 import sys
 import tomllib
+from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import Tran
 from fingerspice.circuit.devices import layer_devices
 from fingerspice.netlist import lexer
-from fingerspice.netlist.expressions import Value, Word, definitions
+from fingerspice.netlist.expressions import Call, Value, Word, definitions
 from fingerspice.netlist.lexer import Assignment, Lexeme, Line, decimal_comma, group, lex, logical_lines, nearest
 from fingerspice.waveforms.files import file_fault
 from fingerspice.waveforms.waveform import refuse
@@ -193,16 +194,6 @@ _UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
 DIRECTIVES = (*_USED, ".option", *_UNUSED, ".nodeset", ".backanno", ".endc")
 
 
-class Directive(NamedTuple):
-    """A line such as `.tran 10u 50m uic`."""
-
-    name: str  # Name in lower case, with its dot
-    args: tuple[Word, ...]
-    params: dict[str, Value]  # By key in lower case; `.ic v(area)=1` has the key ``v(area)`` of the flat circuit
-    where: Where  # Place of the dot
-    text: str  # The line as written, continuations joined
-
-
 class Statement(NamedTuple):
     """One element of the flat circuit."""
 
@@ -241,7 +232,7 @@ class Deck:
     path: Path | None  # Path of the file; None for a text
     title: str = ""  # The first line in printable characters (see `errors.printable`)
     statements: list[Statement] = field(default_factory=list)  # In the order of the file, subcircuit calls expanded
-    directives: list[Directive] = field(default_factory=list)  # Those with values
+    directives: dict[str, list[Call]] = field(default_factory=lambda: defaultdict(list))  # Those with values, by name
     libraries: list[str] = field(default_factory=list)  # Included files of native devices, without folder; not read
     files: list[Path] = field(default_factory=list)  # The other included files, which were read
     unused: dict[str, None] = field(default_factory=dict)  # Ordered set of the directives without effect here
@@ -263,10 +254,6 @@ class Deck:
     def file(self) -> str:
         """The file's name as shown to the user."""
         return "<netlist>" if self.path is None else str(self.path)
-
-    def named(self, name: str) -> list[Directive]:
-        """The directives of that name."""
-        return [directive for directive in self.directives if directive.name == name]
 
     def split(self, text: str, where: Where | None = None) -> list[str]:
         """Physical lines of the deck or of an included file; refuses more than `MAX_LINES` lines in all."""

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
-from fingerspice.base.errors import InputError, Where
+from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import SmallSignal
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.netlist.expressions import Call, Number, Token, Word, number
+from fingerspice.netlist.expressions import Call, Number, Token, Word, evaluated, number
 from fingerspice.netlist.lexer import is_unit, nearest
 from fingerspice.netlist.reader import Context, Statement
 from fingerspice.waveforms.files import read_table
@@ -22,135 +23,54 @@ from fingerspice.waveforms.waveform import AM, DC, Chirp, Exp, Sine, Waveform, r
 _KEPT_BYTES = 2**25  # A larger WAV file is read in parts when needed: 32 MiB are six minutes of 16 bits at 48 kHz.
 
 
-class _Arguments:
-    """The words of one call of a source function, by name, and how they are read."""
-
-    def __init__(self, call: Call, function: Function, context: Context) -> None:
-        self.call, self.context = call, context
-        self.name = call.text.upper()
-        names, given = function.names.split(), len(call.args)
-        self.usage = f"allowed: {function.usage or f'{self.name}({function.names})'}"
-        if given < function.required:
-            self.refuse(f"{self.name} needs {function.required} values, {given} given")
-        if given > len(names) > 0:
-            hint = "; Ncycles is not supported, a burst is BURST(amplitude frequency cycles), in Python fs.Burst"
-            self.usage += hint if function.counted and given == len(names) + 1 else ""  # LTspice has one more argument.
-            self.refuse(f"{self.name} takes at most {len(names)} values, {given} given")
-        self.words: dict[str, Word] = dict(zip(names, call.args, strict=False))
-        for key, value in call.params.items():
-            if key not in function.keys.split() or key in self.words:
-                problem = f"{key!r} twice" if key in self.words else f"no parameter {key!r}"
-                self.refuse(f"{self.name} has {problem}", value.key)
-            self.words[key] = value
-
-    def refuse(self, problem: str, where: Where | None = None) -> NoReturn:
-        """Raise the error about the call, or about one of its words."""
-        raise InputError(f"{problem}; {self.usage}", where or self.call.where)
-
-    def get(self, name: str, default: float = math.nan) -> float:
-        return number(self.words[name], f"{self.name} {name}").value if name in self.words else default
-
-    def step_or(self, name: str) -> float:
-        """An argument whose SPICE default is TSTEP."""
-        tran = self.context.tran
-        problem = f"{self.name} leaves out {name}, which defaults to TSTEP, and there is no .tran line"
-        refuse(name not in self.words and tran is None, f"{problem}; allowed: give {name}", self.call)
-        return self.get(name, tran.step if tran else math.nan)
-
-    def whole(self, name: str) -> int | None:
-        if name not in self.words:
-            return None
-        value = number(self.words[name], name).value
-        refuse(value != int(value), f"{name} is {value:g}; allowed: a whole number", self.words[name])
-        return int(value)
-
-    def column(self, name: str) -> str | int | None:
-        word = self.words.get(name)
-        return word.text if isinstance(word, Token) else self.whole(name)
-
-    def upsampled(self, recording: Samples) -> Samples:
-        factor = self.whole("upsample")
-        return recording if factor is None else recording.upsampled(factor)
-
-    def file(self, name: str = "path") -> Path:
-        if name not in self.words:
-            self.refuse(f"{self.name} names no file")
-        return self.context.find(self.words[name].text, self.words[name].where)
-
-
-def _sin(a: _Arguments) -> Waveform:
-    tran = a.context.tran
-    frequency = a.get("FREQ", 1.0 / tran.stop if tran else math.nan)
-    refuse(math.isnan(frequency), "SIN leaves out FREQ, which defaults to 1/TSTOP, and there is no .tran line", a.call)
-    return Sine(a.get("VA"), frequency, a.get("VO"), a.get("PHASE", 0.0), a.get("TD", 0.0), a.get("THETA", 0.0))
-
-
-def _pulse(a: _Arguments) -> Waveform:
-    # TR and TF of 0 mean ideal edges here. PW and PER of 0 mean "for ever", as in ngspice.
-    forever = (a.get("PW", 0.0) or math.inf, a.get("PER", 0.0) or math.inf)
-    return Pulse(a.get("V1"), a.get("V2"), a.get("TD", 0.0), a.step_or("TR"), a.step_or("TF"), *forever)
-
-
-def _exp(a: _Arguments) -> Waveform:
-    td1 = a.get("TD1", 0.0)
-    td2 = a.get("TD2") if "TD2" in a.words else td1 + a.step_or("TD2")
-    return Exp(a.get("V1"), a.get("V2"), td1, a.step_or("TAU1"), td2, a.step_or("TAU2"))
-
-
-def _pwl(a: _Arguments) -> Waveform:
-    shift, repeat = a.get("td", 0.0), a.get("r", -1.0)
-    if "file" in a.words:
-        refuse(a.call.args, "PWL has points and file= too; allowed: one of them", a.call)
-        points = PWL.from_table(a.file("file"), pairs=True)
-        given, levels = points.times, points.values
+def _pwl(*points: float, r: float = -1.0, td: float = 0.0, file: Path | None = None) -> Waveform:
+    refuse(points and file is not None, "PWL has points and file= too; allowed: one of them")
+    if file is not None:
+        table = PWL.from_table(file, pairs=True)
+        given, levels = table.times, table.values
     else:
-        numbers = [number(arg, "PWL value").value for arg in a.call.args]
-        if len(numbers) < 2 or len(numbers) % 2:
-            raise InputError(f"PWL needs pairs of time and value, {len(numbers)} numbers given", a.call.where)
-        given, levels = tuple(numbers[0::2]), tuple(numbers[1::2])
-    times = tuple(t + shift for t in given)
-    if 0.0 <= repeat < given[0]:
+        refuse(len(points) < 2 or len(points) % 2, f"PWL needs pairs of time and value, {len(points)} numbers given")
+        given, levels = points[0::2], points[1::2]
+    times = tuple(t + td for t in given)
+    if 0.0 <= r < given[0]:
         # If the repeated part begins before the first point, its first value is that of the first point.
-        times, levels = (repeat + shift, *times), (levels[0], *levels)
-    return PWL(times, levels, repeat + shift if repeat >= 0.0 else None)
+        times, levels = (r + td, *times), (levels[0], *levels)
+    return PWL(times, levels, r + td if r >= 0.0 else None)
 
 
-def _wavefile(a: _Arguments) -> Waveform:
-    path = a.file()
-    if "gain" not in a.words:
-        a.refuse(f"{a.name} has no gain, the V at full scale")
+def _wavefile(path: Path, /, gain: float, channel: int | None = None, *, upsample: int | None = None) -> Waveform:
     small = not path.is_file() or path.stat().st_size <= _KEPT_BYTES
-    return a.upsampled(Samples.from_wav(path, number(a.words["gain"], "gain").value, a.whole("channel"), at_once=small))
+    recording = Samples.from_wav(path, gain, channel, at_once=small)
+    return recording if upsample is None else recording.upsampled(upsample)
 
 
-def _table(a: _Arguments) -> Waveform:
-    path, given = a.file(), a.get("rate") if "rate" in a.words else None
-    values, rate, times = read_table(path, a.column("time"), a.column("value"), given)
-    if rate is not None:
-        return a.upsampled(Samples(values, rate))
-    refuse("upsample" in a.words, "TABLE upsample goes with a rate, and this table has times", a.call)
-    return PWL(times, values)  # type: ignore[arg-type]
+def _table(
+    path: Path, /, time: str | int | None = None, value: str | int | None = None, *, rate: float | None = None,
+    upsample: int | None = None,
+) -> Waveform:  # fmt: skip
+    values, rate, times = read_table(path, time, value, rate)
+    if rate is None:
+        refuse(upsample is not None, "TABLE upsample goes with a rate, and this table has times")
+        return PWL(times, values)  # type: ignore[arg-type]
+    recording = Samples(values, rate)
+    return recording if upsample is None else recording.upsampled(upsample)
 
 
-def _burst(a: _Arguments) -> Waveform:
-    frequency, every = a.get("frequency"), a.get("every", 0.0)
-    burst = Burst(Sine(a.get("amplitude"), frequency), a.get("cycles") / frequency)
+def _burst(amplitude: float, frequency: float, cycles: float, every: float = 0.0, /) -> Waveform:
+    burst = Burst(Sine(amplitude, frequency), cycles / frequency)
     return Repeat(burst, every) if every else burst
 
 
-def _plain(made: Callable[..., Waveform]) -> Callable[[_Arguments], Waveform]:
-    """A waveform of its own numbers, in their order."""
-    return lambda a: made(*(a.get(name) for name in a.words))
-
-
 class Function(NamedTuple):
-    """A source function."""
+    """A source function.
 
-    make: Callable[[_Arguments], Waveform]
-    names: str  # Names of its words, in their order; empty for any number of words
-    required: int = 0  # Number of words that are needed
-    keys: str = ""  # Words that may be given as key=value
-    usage: str = ""  # What is allowed, if that is not NAME(names)
+    Its words are the parameters of `make`, in their order; those that are not positional only may be given as
+    key=value. A parameter without annotation is a number. A default that is a text is an expression of the words before
+    it and of the .tran line's TSTEP and TSTOP.
+    """
+
+    make: Callable[..., Waveform]
+    usage: str = ""  # What is allowed, if that is not NAME(words)
     counted: bool = False  # Whether LTspice adds a number of periods
     refused: str = ""  # Why it is refused in decks, which a SPICE may read, too; --source takes it
 
@@ -158,25 +78,34 @@ class Function(NamedTuple):
 _CHANGED = "changed its argument order between ngspice versions; write the waveform as PWL"
 #: Source functions by name; an entry is all that a new source function needs.
 SOURCES: Mapping[str, Function] = {
-    "sin": Function(_sin, "VO VA FREQ TD THETA PHASE", 2, counted=True),
-    "pulse": Function(_pulse, "V1 V2 TD TR TF PW PER", 2, counted=True),
-    "exp": Function(_exp, "V1 V2 TD1 TAU1 TD2 TAU2", 2),
-    "pwl": Function(_pwl, "", keys="r td file", usage="r, td and file"),
-    "square": Function(_plain(Square), "amplitude frequency duty", 2),
-    "triangle": Function(_plain(Triangle), "amplitude frequency", 2),
-    "sawtooth": Function(_plain(Sawtooth), "amplitude frequency", 2),
-    "chirp": Function(_plain(Chirp), "amplitude f0 f1 duration", 4),
-    "am": Function(_plain(AM), "amplitude carrier envelope depth", 3, refused=f"AM {_CHANGED}, or give it by --source"),
-    "burst": Function(_burst, "amplitude frequency cycles every", 3),
-    "wavefile": Function(
-        _wavefile, "path gain channel", keys="gain channel upsample",
-        usage="WAVEFILE(path gain [channel]) with gain in V at full scale",
+    "sin": Function(
+        lambda VO, VA, FREQ="1/TSTOP", TD=0.0, THETA=0.0, PHASE=0.0, /: Sine(VA, FREQ, VO, PHASE, TD, THETA),
+        counted=True,
     ),
-    "table": Function(
-        _table, "path time value", keys="time value rate upsample",
-        usage="TABLE(path [time_column value_column]) or TABLE(path rate=RATE)",
+    # TR and TF of 0 mean ideal edges here. PW and PER of 0 mean "for ever", as in ngspice.
+    "pulse": Function(
+        lambda V1, V2, TD=0.0, TR="TSTEP", TF="TSTEP", PW=0.0, PER=0.0, /: (
+            Pulse(V1, V2, TD, TR, TF, PW or math.inf, PER or math.inf)
+        ),
+        counted=True,
     ),
+    "exp": Function(
+        lambda V1, V2, TD1=0.0, TAU1="TSTEP", TD2="TD1+TSTEP", TAU2="TSTEP", /: Exp(V1, V2, TD1, TAU1, TD2, TAU2)
+    ),
+    "pwl": Function(_pwl, "r, td and file"),
+    "square": Function(lambda amplitude, frequency, duty=0.5, /: Square(amplitude, frequency, duty)),
+    "triangle": Function(lambda amplitude, frequency, /: Triangle(amplitude, frequency)),
+    "sawtooth": Function(lambda amplitude, frequency, /: Sawtooth(amplitude, frequency)),
+    "chirp": Function(lambda amplitude, f0, f1, duration, /: Chirp(amplitude, f0, f1, duration)),
+    "am": Function(
+        lambda amplitude, carrier, envelope, depth=1.0, /: AM(amplitude, carrier, envelope, depth),
+        refused=f"AM {_CHANGED}, or give it by --source",
+    ),
+    "burst": Function(_burst),
+    "wavefile": Function(_wavefile, "WAVEFILE(path gain [channel]) with gain in V at full scale"),
+    "table": Function(_table, "TABLE(path [time_column value_column]) or TABLE(path rate=RATE)"),
 }  # fmt: skip
+_MISSING = {"path": "names no file", "gain": "has no gain, the V at full scale"}
 _KNOWN = ", ".join(name.upper() for name, function in SOURCES.items() if not function.refused)
 _LEVELS = {"dc": "DC value", "ac": "AC [magnitude [phase]]"}  #: What is no source function, with what is allowed.
 _ALIASES = {"sine": "sin", "wav": "wavefile"}  #: Names in LTspice, and a short one for the command line.
@@ -261,9 +190,54 @@ def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
         hint = nearest(key, SOURCES)
         raise InputError(f"{name}: unknown source {key.upper()!r}{hint}; allowed: {_KNOWN}", call.where)
     try:
-        return function.make(_Arguments(call, function, context))
+        return _made(function, call, context)
     except InputError as error:
         raise error if error.where else InputError(f"{name}: {error.message}", call.where) from None
+
+
+def _made(function: Function, call: Call, context: Context) -> Waveform:
+    """The waveform of a call, whose words become the arguments of a source function."""
+    name, given, taken = call.text.upper(), len(call.args), inspect.signature(function.make).parameters
+    listed = [key for key, p in taken.items() if p.kind <= p.POSITIONAL_OR_KEYWORD]
+    named = [key for key, p in taken.items() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    needed = sum(taken[key].default is inspect.Parameter.empty and key not in _MISSING for key in listed)
+    usage = "allowed: " + (function.usage or f"{name}({' '.join(listed)})")
+    refuse(given < needed, f"{name} needs {needed} values, {given} given; {usage}", call)
+    if given > len(listed) > 0:
+        hint = "; Ncycles is not supported, a burst is BURST(amplitude frequency cycles), in Python fs.Burst"
+        usage += hint if function.counted and given == len(listed) + 1 else ""  # LTspice has one more argument.
+        raise InputError(f"{name} takes at most {len(listed)} values, {given} given; {usage}", call.where)
+    words: dict[str, Word] = dict(zip(listed, call.args, strict=False))
+    for key, word in call.params.items():
+        problem = f"{key!r} twice" if key in words else f"no parameter {key!r}"
+        refuse(key in words or key not in named, f"{name} has {problem}; {usage}", word.key)
+        words[key] = word
+    tran, values = context.tran, dict[str, Any]()
+    for key, p in taken.items():
+        if key in words:
+            values[key] = _argument(f"{name} {key}", str(p.annotation), words[key], context)
+        elif isinstance(p.default, str):
+            problem = f"{name} leaves out {key}, which defaults to {p.default}, and there is no .tran line"
+            if tran is None:
+                raise InputError(f"{problem}; allowed: give {key}", call.where)
+            known = {"tstep": tran.step, "tstop": tran.stop} | {k.lower(): v for k, v in values.items()}
+            values[key] = evaluated(p.default, known, lambda _: call.where)
+        elif p.kind != p.VAR_POSITIONAL:
+            refuse(p.default is p.empty, f"{name} {_MISSING.get(key)}; {usage}", call)
+            values[key] = p.default
+    row = [values.pop(key) for key in listed] if listed else [number(arg, f"{name} value").value for arg in call.args]
+    return function.make(*row, **values)
+
+
+def _argument(what: str, kind: str, word: Word, context: Context) -> Any:
+    """A word as the argument of a Python function whose parameter is annotated so; a number where it is not."""
+    if kind.startswith("Path"):
+        return context.find(word.text, word.where)
+    if kind.startswith("str") and isinstance(word, Token):
+        return word.text
+    value = number(word, what).value
+    refuse("int" in kind and value != int(value), f"{what} is {value:g}; allowed: a whole number", word)
+    return int(value) if "int" in kind else value
 
 
 def _differences(key: str, waveform: Waveform, call: Call) -> Iterator[str]:

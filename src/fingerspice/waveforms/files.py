@@ -259,20 +259,18 @@ class WavLayout:
         width = int(self.kind[2])
         block = self.channels * width
         try:
-            with self.path.open("rb") as file:
-                file.seek(self.offset + first * block)
-                raw = file.read((last - first) * block)
+            raw = np.fromfile(self.path, np.uint8, (last - first) * block, offset=self.offset + first * block)
         except OSError as error:
             raise InputError(f"'{self.path}' cannot be read: {error.strerror}") from None
-        refuse(len(raw) < (last - first) * block, f"'{self.path}' has become shorter while it was read")
+        refuse(raw.size < (last - first) * block, f"'{self.path}' has become shorter while it was read")
         if width in (1, 2, 4, 8):
-            stored = np.frombuffer(raw, self.kind).reshape(-1, self.channels)[:, self.channel]
+            stored = raw.view(self.kind).reshape(-1, self.channels)[:, self.channel]
         else:
             # The sample fills the upper bytes of an integer that NumPy knows.
             full = 4 if width == 3 else 8
             wide = np.zeros((last - first, full), np.uint8)
             low = full - width if self.kind[0] == "<" else 0
-            wide[:, low : low + width] = np.frombuffer(raw, np.uint8).reshape(-1, self.channels, width)[:, self.channel]
+            wide[:, low : low + width] = raw.reshape(-1, self.channels, width)[:, self.channel]
             stored = wide.view(f"{self.kind[0]}i{full}")[:, 0]
         values = stored.astype(float)
         if width == 1:

@@ -120,11 +120,7 @@ class SourceTable:
         """Values (V) of the series at times (s) within the table."""
         i = np.clip(np.searchsorted(self.edges, t, side="right") - 1, 0, self.edges.size - 2)
         x = 2.0 * (t - self.edges[i]) / (self.edges[i + 1] - self.edges[i]) - 1.0
-        out = np.empty(t.size)
-        for k in np.unique(i):
-            here = i == k
-            out[here] = np.polynomial.chebyshev.chebval(x[here], self.series[k])
-        return out
+        return np.asarray(np.polynomial.chebyshev.chebval(x, self.series.T.take(i, 1), tensor=False))
 
     def unseen(self, waveform: Waveform, t: FloatArray, tol: float) -> tuple[float, float] | None:
         """The first of the times (s) at which a function differs from its table, and the difference (V), or None."""
