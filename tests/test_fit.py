@@ -414,6 +414,7 @@ def test_data_in_another_unit_are_told_and_end_in_a_bounded_number_of_evaluation
     with pytest.warns(fs.FingerspiceWarning, match=said):
         found = fs.fit(circuit, some, ["Xgap.d"], starts=1, rtol=1e-4, skin="follow")
     assert found.evaluations <= 40
+    assert "sigma unknown, as there are no more values than parameters" in str(found)
     assert 1e-3 <= found.estimates["Xgap.d"].value / 3.5e-6 <= 1e3
 
 

@@ -21,6 +21,7 @@ from fingerspice.base.units import parse_number
 from fingerspice.waveforms.waveform import refuse
 
 _UNIT = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
+_BEFORE_UNIT = re.compile(r"\s+(?=[\[(])")  # A blank that separates no columns
 # Names that simulators give to a voltage between nodes or the current of an element: V(n001), I(R1), Ix(u1:in).
 _PROBE = re.compile(r"[vi]\w?\((.*)\)", re.IGNORECASE)
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
@@ -99,7 +100,8 @@ class Columns:
         known = _UNITS[to]
         unit = self.units[column] if self.units else ""
         factors = {name.lower(): factor for name, factor in known.items()}
-        if unit and unit.lower() not in factors:
+        # A capital M may be mega, a factor of 1e9 beside milli.
+        if unit and (unit.lower() not in factors or unit[0] == "M"):
             allowed = ", ".join(name for name in known if name.isascii())
             problem = f"'{self.file}': the unit of column {self.names[column]!r} is {unit!r}"
             raise InputError(f"{problem}; allowed: {allowed}")
@@ -142,6 +144,7 @@ def read_text_columns(path: str | Path, label: str | None = None) -> Columns:
     count = len(_cells(line, separator))
     # The line above the first numbers has the names, unless it is a comment or, here `;`, there is none.
     number, text = [(0, ";"), *((one, above.strip()) for one, above in numbered if one < begin)][-1]
+    text = _BEFORE_UNIT.sub("", text) if separator is None else text
     header = _cells(text.lstrip("#"), separator)
     if len(header) != count or text[0] in ";*":
         hint = ", or are its commas decimal commas" if separator == "," and count == 2 * len(header) else ""

@@ -303,8 +303,12 @@ class Fit(FitResult):
         share = 100.0 * self._rms / (float(np.abs(data.values).max()) or 1.0)
         known = "as given"
         if data.sigma is None:
-            equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
-            known = f"estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
+            lowest, highest = float(self.sigma.min()), float(self.sigma.max())
+            known = "estimated from the residuals, as equal shares of the values"
+            if lowest >= highest * (1.0 - 1e-9):
+                known = "estimated from the residuals, equal for all"
+            if highest == np.inf:
+                known = "unknown, as there are no more values than parameters"
         head = f"{len(self.estimates)} parameters fitted to {data.values.size} values of {data.name}"
         size = f"{self._rms:.3g} {MEASURED[data.signal]} rms, {share:.2g} % of the largest value"
         groups = [f"groups by {column}: {', '.join(dict.fromkeys(of))}" for column, of in data.groups.items()]
