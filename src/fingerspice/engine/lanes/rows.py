@@ -381,8 +381,9 @@ def along(
                 _until(wide, c.rates[k], c.gain[k], 1.0, length, m[0], m[1], own[0], own[1], own[2])
             for i in range(lanes):
                 mode[i] = own[0, i * each] * mode[i] + own[1, i * each] * before[i] + own[2, i * each] * after[i]
-        for most in moves[t // width : t // width + 1]:
+        if t // width < len(moves):
+            most, begins = moves[t // width], t % width == 0
             for i in range(lanes):
                 move = abs(after[i] - before[i])
-                most[i] = move if t % width == 0 or move > most[i] else most[i]
+                most[i] = move if begins or move > most[i] else most[i]
         before, after = after, before

@@ -161,23 +161,6 @@ def smooth(marks: Any, c: Any, weights: FloatArray, a: float, state: FloatArray)
 
 
 @jit_within_rows
-def _bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
-    """Add the modes' response to what the cubic through N lacks, whose slope at the end of the step is known."""
-    lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), places(marks)
-    drives = leaks + 1
-    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    _changes(marks, c, weights, NODES - 1, state)
-    for i in range(lanes):
-        for j in range(NODES):
-            of_cubic = END_SLOPES[j] * state[(at.g + j * drives + leaks) * lanes + i]
-            state[at.scratch * lanes + i] -= of_cubic
-    for k in range(m):
-        p = (k + 1) * weights_of(marks).mode - 1
-        for i in range(lanes):
-            state[(SOURCES + k) * lanes + i] += weights[p * wide + i * each] * state[at.scratch * lanes + i]
-
-
-@jit_within_rows
 def _fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """Add what is left of what `smooth` has taken, and the modes' response to it by N and, as one, by the leaks."""
     lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
@@ -205,9 +188,19 @@ def end_bent(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatA
 
     They follow from xi there, on the tangents at the last node.
     """
-    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    lanes, leaks, at, rows = len(marks.lanes), len(marks.leaks), places(marks), weights_of(marks)
     drives, last = leaks + 1, NODES - 1
-    _bend_end(marks, c, weights, state)
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    # The modes' response to what the cubic through N lacks, whose slope at the end of the step is known.
+    _changes(marks, c, weights, last, state)
+    for i in range(lanes):
+        for j in range(NODES):
+            of_cubic = END_SLOPES[j] * state[(at.g + j * drives + leaks) * lanes + i]
+            state[at.scratch * lanes + i] -= of_cubic
+    for k in range(len(marks.modes)):
+        p = (k + 1) * rows.mode - 1
+        for i in range(lanes):
+            state[(SOURCES + k) * lanes + i] += weights[p * wide + i * each] * state[at.scratch * lanes + i]
     if fades:
         _fade(marks, c, weights, state)
     project(marks, c, 1, at.xi, state)
