@@ -32,6 +32,7 @@ from fingerspice.waveforms.waveform import require
 
 # Default length of a chunk, s; number of outputs in a window of a run that is not integrated sample by sample.
 CHUNK, WINDOW = 10.0, 1 << 14
+_NO_OUTPUTS = np.empty(0), np.empty(0, bool), np.empty((0, 0))
 #: State of a stream before a piece, as plain data: another stream continues from it with the same bytes.
 Mark = dict[str, Any]
 
@@ -86,11 +87,10 @@ class Stream:
         own, by_samples = own_rtol(problem, plan, rtol), method == "auto" and plan.tier == "coupled"
         self._pieces, form = (prepared(problem, own) if by_samples else None) or ([], None)
         self._place, self._march = 0, None if form is None else LaneMarch(problem, form, own)
-        # Of a run in windows, such as what the method for recordings fails on: the method asked for and, of the last
-        # window, the one used, state, peaks and run.
+        # Of a run in windows, such as what the method for recordings fails on: the method asked for, and the one used
+        # and the run of the last window.
         self._asked, self._method = (method, method) if form is None else ("exponential", "relaxation")
-        self._state, self._gaps = problem.initial, np.zeros((0, 4))
-        self._last: Run | None = None
+        self._last = Run(*_NO_OUTPUTS, Status.SUCCESS, 0, {}, problem.initial)
 
     def __iter__(self) -> Iterator[Solution]:
         return self
@@ -124,8 +124,8 @@ class Stream:
             self._march.stand(mark["march"])
         else:
             kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
-            self._state, self._march = State(**kept), None
-            self._gaps = np.array(mark["gaps"], float).reshape(-1, 4)
+            gaps, self._march = np.array(mark["gaps"], float).reshape(-1, 4), None
+            self._last = replace(self._last, state=State(**kept), gaps=gaps)
         self._reach(done + 1)
         self._take(done - mark["written"])
 
@@ -133,16 +133,13 @@ class Stream:
         """The mark of the state reached."""
         if self._march is not None:
             return {"written": self._written, "place": self._place, "march": self._march.mark()}
-        state = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self._state).items()}
-        return {"written": self._written, "state": state, "gaps": self._gaps.tolist()}
+        state = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self._last.state).items()}
+        return {"written": self._written, "state": state, "gaps": self._last.gaps.tolist()}
 
     @property
     def _over(self) -> bool:
         """Whether the run has reached its end, or failed."""
-        if self._march is not None:
-            return self._place == len(self._pieces)
-        failed = self._last is not None and self._last.status is not Status.SUCCESS
-        return failed or self._written == self.outputs.total
+        return self._last.status is not Status.SUCCESS or self._written == self.outputs.total
 
     def _reach(self, written: int) -> None:
         """Integrate pieces until so many outputs are there, or the run ends."""
@@ -173,7 +170,7 @@ class Stream:
             march.follow(piece, run_at, out)
         except LostError:
             # The state before this piece.
-            self._state, self._march = march.state, None
+            self._last, self._march = replace(self._last, state=march.state), None
             return self._window()
         if last:
             march.finish(run_at, out)
@@ -186,15 +183,15 @@ class Stream:
         end = min(self._written + WINDOW, self.outputs.total)
         t, whole = self.outputs.times(self._written, end), self.problem
         stop = whole.t_stop if end == self.outputs.total else on_breakpoint(whole.network.waveform, float(t[-1]))
-        start, state = self._state.t, self._state
+        state = self._last.state
+        start = state.t
         scene = replace(whole.scene, network=within(whole.network, start, stop + whole.step))
         problem = replace(whole, scene=scene, t_start=start, t_stop=stop, first=start, initial=state)
         problem = problem.at(at_breakpoints(problem, t), np.zeros(t.size, bool))
         run, self._method = integrated(problem, self.plan, self.rtol, self._asked)
-        if run.gaps.shape == self._gaps.shape:
-            run.gaps = np.maximum(run.gaps, self._gaps)
-        self._last, self._gaps, self._state = run, run.gaps, run.state
-        self._written += run.t.size
+        if run.gaps.shape == self._last.gaps.shape:
+            run.gaps = np.maximum(run.gaps, self._last.gaps)
+        self._last, self._written = run, self._written + run.t.size
         record = run.record(problem)
         shown, n = whole.scene.shown.network, record.network.k.shape[0]
         if len(shown.cells) == len(record.network.cells):
@@ -204,13 +201,12 @@ class Stream:
         return t[: run.t.size], np.column_stack([record.u_layer[:, place], record.rows[:, n:]])
 
     def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
-        problem, none = self.problem, (np.empty(0), np.empty(0, bool), np.empty((0, 0)))
+        problem = self.problem
         if self._march is not None:
-            run = self._march.run(*none)
+            run = self._march.run(*_NO_OUTPUTS)
             state_error(problem, run, self.plan, self.rtol)
         else:
-            assert self._last is not None
-            run = replace(self._last, t=none[0], left=none[1], rows=none[2], continuous=None)
+            run = replace(self._last.only(np.zeros(self._last.t.size, bool)), continuous=None)
         if self._t.size or not self._over:
             # A failure concerns a later chunk if outputs before it are still waiting for their chunk.
             run.status, run.t_failed = Status.SUCCESS, None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.compiled import jit, jit_rows, jit_within, jit_within_rows
+from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.lanes.rows import SOURCES, WEIGHTS, Marks, places, polynomial_rows, rise_of, weigh
 from fingerspice.engine.lanes.step import step
 from fingerspice.numerics.modes import copy_to
@@ -26,14 +26,6 @@ def _put(marks: Any, starts: FloatArray, source: FloatArray, state: FloatArray) 
         state[2 * lanes + i] = source[i]
         for k in range(len(marks.modes)):
             state[(SOURCES + k) * lanes + i] = starts[k, i]
-
-
-@jit_within
-def _settle(marks: Any, state: FloatArray) -> None:
-    """Forget the distance to the fold after a step of length 0, as it tells nothing on the way to the gap voltage."""
-    at, lanes = places(marks), len(marks.lanes)
-    for i in range(lanes if len(marks.mobile) > 0 else 0):
-        state[at.fold * lanes + i] = state[(at.q + 2) * lanes + i] * state[(at.q + 1) * lanes + i]
 
 
 @jit
@@ -69,10 +61,8 @@ def span(
             for p in range(-1 if done + k == 0 else 0, parts):
                 by, to = (still, before) if p < 0 else (flat, after[k * lanes :])
                 step(marks, c, by, state, to, max(p, 0) / parts, (p + 1) / parts if p >= 0 else 1.0)
-                if p < 0:
-                    _settle(marks, state)
-                    for i in range(lanes if rows > m else 0):
-                        kept[m, i, 0] = state[(SOURCES + m) * lanes + i]
+                for i in range(lanes if p < 0 and rows > m else 0):
+                    kept[m, i, 0] = state[(SOURCES + m) * lanes + i]
             for i in range(rows * lanes):
                 found[k * rows * lanes + i] = state[SOURCES * lanes + i]
         off = 0.0
@@ -118,20 +108,7 @@ def hand_on(left: FloatArray, added: FloatArray, before: FloatArray, out: FloatA
 GAP, SQUARES, AREAS, MORE = range(4)
 
 
-@jit_within_rows
-def _gap_and_area(marks: Any, c: Any, node: int, state: FloatArray, u: FloatArray, q: FloatArray) -> None:
-    """Gap voltage and 1/A - q0 at a node, of every lane."""
-    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    for i in range(lanes):
-        u[i] = abs(state[(at.xi + node) * lanes + i]) * c.scale + c.shift
-    polynomial_rows(lanes, c.area, u, q)
-    for i in range(lanes):
-        u[i] = state[(at.xi + node) * lanes + i]
-        if len(marks.bend) > len(marks.mobile):
-            u[i] -= c.kappa * state[(at.g + node * (leaks + 1) + leaks) * lanes + i]
-
-
-@jit
+@jit_rows
 def lead(
     marks: Any, c: Any, weights: FloatArray, z: FloatArray, x: FloatArray, to: FloatArray, h: FloatArray, parts: int,
     shifts: FloatArray, state: FloatArray, out: FloatArray,
@@ -142,8 +119,8 @@ def lead(
     The `shifts` (count, m + 2) are of the modes at the start, and of the source at start and end. The modes at the end
     and the rows named above go into `out` (count, m + MORE, n). For `weights` and `state` see `span`.
     """
-    lanes, m, last = len(marks.lanes), len(marks.modes), len(marks.inner) + 1
-    n, still, flat = x.size, weights[0].reshape(-1), weights[1].reshape(-1)
+    lanes, m, leaks, last = len(marks.lanes), len(marks.modes), len(marks.leaks), len(marks.inner) + 1
+    at, n, still, flat = places(marks), x.size, weights[0].reshape(-1), weights[1].reshape(-1)
     modes, before, after, length = np.empty((m, lanes)), np.empty(lanes), np.empty(lanes), np.empty(lanes)
     found, u, q = np.empty((m + MORE, lanes)), np.empty(lanes), np.empty(lanes)
     for first in range(0, n, lanes):
@@ -166,12 +143,16 @@ def lead(
                         a, b = (0.0, 1.0) if part < 0 else (part / parts, (part + 1) / parts)
                         step(marks, c, by, state, source, a, b)
                     if part < 0:
-                        _settle(marks, state)
                         continue
                     # After a step its end is node 0 of the next one.
-                    _gap_and_area(marks, c, node % last, state, u, q)
-                    share = WEIGHTS[last - 2, node]
+                    place, share = node % last, WEIGHTS[last - 2, node]
                     for i in range(lanes):
+                        u[i] = abs(state[(at.xi + place) * lanes + i]) * c.scale + c.shift
+                    polynomial_rows(lanes, c.area, u, q)
+                    for i in range(lanes):
+                        u[i] = state[(at.xi + place) * lanes + i]
+                        if len(marks.bend) > len(marks.mobile):
+                            u[i] -= c.kappa * state[(at.g + place * (leaks + 1) + leaks) * lanes + i]
                         area = share * length[i] / (c.q0 + q[i])
                         found[m + SQUARES, i] += u[i] * u[i] * area
                         found[m + AREAS, i] += area
@@ -238,53 +219,15 @@ def show(
 
 
 @jit_rows
-def _variable(n: int, scale: float, shift: float, xi: FloatArray, x: FloatArray) -> None:
-    for i in range(n):
-        x[i] = abs(xi[i]) * scale + shift
-
-
-@jit
 def polynomial_of(powers: FloatArray, scale: float, shift: float, xi: FloatArray, out: FloatArray) -> None:
     """A polynomial of `engine.lanes.rows.Lanes` at xi (n,)."""
     x = np.empty(xi.size)
-    _variable(xi.size, scale, shift, xi, x)
+    for i in range(xi.size):
+        x[i] = abs(xi[i]) * scale + shift
     polynomial_rows(xi.size, powers, x, out)
 
 
 @jit_rows
-def _last_drive(n: int, c: Any, mobile: bool, xi: FloatArray, s: FloatArray, q: FloatArray, g: FloatArray) -> None:
-    """N, which takes the sign of xi, or A - 1/q0 times the source."""
-    for i in range(n):
-        g[i] = -q[i] / (c.q0 * (c.q0 + q[i])) * s[i] if mobile else g[i] if xi[i] >= 0.0 else -g[i]
-
-
-@jit_rows
-def _add(n: int, q: FloatArray, w: FloatArray, a: float, out: FloatArray, b: float, other: FloatArray) -> None:
-    """Add a product to two rows."""
-    for i in range(n):
-        out[i] += a * q[i] * w[i]
-        other[i] += b * q[i] * w[i]
-
-
-@jit_rows
-def _by_area(
-    n: int, c: Any, k: float, share: float, s: FloatArray, slope: FloatArray, u: FloatArray, q: FloatArray,
-    steep: FloatArray, rate: FloatArray, out: FloatArray,
-) -> None:  # fmt: skip
-    """Add what follows from the source's slope, and from N by xi (`rise_of`), of which `rate` is the part by modes.
-
-    Under `mobile`, where `steep` has numbers, A s stands for N and depends on the gap voltage u, whose rate is that by
-    xi over the distance to the fold.
-    """
-    for i in range(n if steep.size == 0 else 0):
-        out[i] += k * slope[i] + share * rise_of(c.q0, c.kappa, q[i]) * (rate[i] + c.k * slope[i])
-    for i in range(steep.size):
-        inverse, rise = c.q0 + q[i], steep[i] if u[i] >= 0.0 else -steep[i]
-        du = (c.k * slope[i] + rate[i] * inverse / c.q0) / (1.0 - (u[i] - c.k * s[i]) / inverse * rise)
-        out[i] += k * slope[i] + share * (slope[i] - s[i] * rise * du / inverse) / inverse
-
-
-@jit
 def flow(
     c: Any, by: FloatArray, share: float, x: FloatArray, slope: FloatArray, first: IntArray, count: int,
     kept: FloatArray, xi: FloatArray, out: FloatArray,
@@ -295,7 +238,7 @@ def flow(
     """
     m, leaks, drives, n, mobile = c.rates.size, c.tap_s.size, c.feed.shape[1], xi.size, kept.shape[0] > c.rates.size
     rate, q, w, steep = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
-    bend, one, of_leak = np.zeros(count), np.ones(count), np.empty(1 + m)
+    g, of_leak = np.zeros(count), np.empty(1 + m)
     # Shares of source and modes, and of drives, in the rates of the quantity and of xi.
     by_z, by_g = np.zeros((2, 1 + m)), np.zeros((2, drives))
     for j in range(m):
@@ -304,25 +247,42 @@ def flow(
             by_z[row, 1 + j] = -own * c.rates[j]
             for t in range(drives):
                 by_g[row, t] += own * c.feed[j, t]
+    q0, k, of_xi = c.q0, by[0], c.k
     for i in range(first.size):
         size, at = min(count, n - first[i]), first[i]
         if size <= 0:
             break
-        s, u, to = x[at:], xi[at : at + size], out[at:]
+        s, rise, u, to = x[at:], slope[at:], xi[at : at + size], out[at:]
         polynomial_of(c.area, c.scale, c.shift, u, q)
         _of_source_and_modes(size, by_z[0], s, i, kept, to)
         _of_source_and_modes(size, by_z[1], s, i, kept, rate)
+        # The last drive is N, which takes the sign of xi, or A - 1/q0 times the source.
         if mobile:
             polynomial_of(c.slope, c.scale, c.shift, u, steep)
-        elif drives > leaks:
-            polynomial_of(c.bend, c.scale, c.shift, u, bend)
-        if drives > leaks:
-            _last_drive(size, c, mobile, u, s, q, bend)
-            _add(size, one, bend, by_g[0, leaks], to, by_g[1, leaks], rate)
-        for t in range(leaks):
-            of_leak[0], of_leak[1:] = c.tap_s[t], c.taps[t]
-            _of_source_and_modes(size, of_leak, s, i, kept, w)
             for j in range(size):
-                w[j] += c.bent[t] * bend[j]
-            _add(size, q, w, by_g[0, t], to, by_g[1, t], rate)
-        _by_area(size, c, by[0], share, s, slope[at:], u, q, steep[: size if mobile else 0], rate, to)
+                g[j] = -q[j] / (q0 * (q0 + q[j])) * s[j]
+        elif drives > leaks:
+            polynomial_of(c.bend, c.scale, c.shift, u, g)
+            for j in range(size):
+                g[j] = g[j] if u[j] >= 0.0 else -g[j]
+        for t in range(drives):
+            a, b = by_g[0, t], by_g[1, t]
+            if t < leaks:
+                of_leak[0], of_leak[1:], bent = c.tap_s[t], c.taps[t], c.bent[t]
+                _of_source_and_modes(size, of_leak, s, i, kept, w)
+                for j in range(size):
+                    w[j] = q[j] * (w[j] + bent * g[j])
+            drive = w if t < leaks else g
+            for j in range(size):
+                to[j] += a * drive[j]
+                rate[j] += b * drive[j]
+        if mobile:
+            # The rate of u is that by xi over the distance to the fold.
+            for j in range(size):
+                inverse, steeper = q0 + q[j], steep[j] if u[j] >= 0.0 else -steep[j]
+                du = of_xi * rise[j] + rate[j] * inverse / q0
+                du /= 1.0 - (u[j] - of_xi * s[j]) / inverse * steeper
+                to[j] += k * rise[j] + share * (rise[j] - s[j] * steeper * du / inverse) / inverse
+        else:
+            for j in range(size):
+                to[j] += k * rise[j] + share * rise_of(q0, c.kappa, q[j]) * (rate[j] + of_xi * rise[j])

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.compiled import jit, jit_rows, jit_within, jit_within_rows
+from fingerspice.base.compiled import jit, jit_rows, jit_within_rows
 from fingerspice.numerics.modes import copy_to
 
 # Lobatto's rules with three nodes (Simpson's) and with four, in a step of length 1: their nodes, weights, and the
@@ -210,7 +210,6 @@ _LEAKS, _BENDS = (
 # The first prediction misses the slope of the leaks. With four nodes the second one is given the opposite error, so
 # that both cancel at the end of the step, whose method is then of third order.
 _LEAKS[1, 1:3, 0] += np.array([-0.5, 0.5]) * INNER[0]
-_weighed_at = jit_within(weighed)
 # Largest rate times length for which moments follow from the highest one, and that from its series.
 _EARLY = 1.0
 
@@ -236,7 +235,9 @@ def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
     for i in range(n):
         highest[i] *= over
     for j in range(top, 0, -1):
-        _below(n, rate, j, h, m[j], m[j - 1])
+        over, upper, lower = 1.0 / j, m[j], m[j - 1]
+        for i in range(n):
+            lower[i] = (1.0 - rate * h[i] * upper[i]) * over
     if longest > _EARLY:
         for i in range(n):
             decay[i] = 1.0
@@ -247,23 +248,11 @@ def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
         for _ in range(6):
             for i in range(n):
                 decay[i] *= decay[i]
-        _late(n, 1, rate, h, decay, m[0])
-        for j in range(1, top + 1):
-            _late(n, j, rate, h, m[j - 1], m[j])
-
-
-@jit_rows
-def _below(n: int, rate: float, j: int, h: FloatArray, m: FloatArray, lower: FloatArray) -> None:
-    over = 1.0 / j
-    for i in range(n):
-        lower[i] = (1.0 - rate * h[i] * m[i]) * over
-
-
-@jit_rows
-def _late(n: int, j: int, rate: float, h: FloatArray, lower: FloatArray, m: FloatArray) -> None:
-    for i in range(n):
-        y = rate * h[i]
-        m[i] = (1.0 - j * lower[i]) / y if y > _EARLY else m[i]
+        for j in range(top + 1):
+            times, lower, upper = max(j, 1), m[j - 1] if j > 0 else decay, m[j]
+            for i in range(n):
+                y = rate * h[i]
+                upper[i] = (1.0 - times * lower[i]) / y if y > _EARLY else upper[i]
 
 
 @jit_rows
@@ -332,7 +321,7 @@ def weigh(c: Any, active: int, inner: int, h: FloatArray, weights: FloatArray) -
     rates, n, m, count, leaks = c.rates, h.size, np.zeros((NODES + 2, h.size)), c.rates.size, c.tap_s.size
     drives, found = c.feed.shape[1], np.empty((3 + 2 * NODES, h.size))
     bent, nodes, places = drives - leaks, inner + 2, PLACES[inner - 1]
-    rows = _weighed_at(count, active, inner, leaks, bent)
+    rows = _weighed(count, active, inner, leaks, bent)
     at_nodes = weights[rows.node :].reshape((nodes - 1, 1 + leaks, rows.one, n))
     at_nodes[:] = 0.0
     for j in range(1, nodes):
@@ -367,20 +356,6 @@ def weigh(c: Any, active: int, inner: int, h: FloatArray, weights: FloatArray) -
 
 
 @jit_rows
-def _move(first: bool, before: FloatArray, after: FloatArray, most: FloatArray) -> None:
-    for i in range(most.size):
-        move = abs(after[i] - before[i])
-        most[i] = move if first or move > most[i] else most[i]
-
-
-@jit_rows
-def _advanced(n: int, each: int, own: FloatArray, before: FloatArray, after: FloatArray, z: FloatArray) -> None:
-    """A mode at the end of a step by the weights of `_until`, which all share where `each` is 0."""
-    for i in range(n):
-        z[i] = own[0, i * each] * z[i] + own[1, i * each] * before[i] + own[2, i * each] * after[i]
-
-
-@jit
 def along(
     c: Any, h: FloatArray, x: FloatArray, first: IntArray, count: int, z: FloatArray, width: int, moves: FloatArray
 ) -> None:  # fmt: skip
@@ -400,11 +375,15 @@ def along(
         for i in range(lanes):
             after[i] = x[first[i] + t + 1]
         for k in range(z.shape[0]):
-            own = rows[k]
+            own, mode = rows[k], z[k]
             if each or t == 0:
                 _moments(1, c.rates[k], length, m)
                 _until(wide, c.rates[k], c.gain[k], 1.0, length, m[0], m[1], own[0], own[1], own[2])
-            _advanced(lanes, each, own, before, after, z[k])
+            for i in range(lanes):
+                mode[i] = own[0, i * each] * mode[i] + own[1, i * each] * before[i] + own[2, i * each] * after[i]
         if t // width < len(moves):
-            _move(t % width == 0, before, after, moves[t // width])
+            most, begins = moves[t // width], t % width == 0
+            for i in range(lanes):
+                move = abs(after[i] - before[i])
+                most[i] = move if begins or move > most[i] else most[i]
         before, after = after, before

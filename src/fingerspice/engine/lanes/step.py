@@ -161,23 +161,6 @@ def smooth(marks: Any, c: Any, weights: FloatArray, a: float, state: FloatArray)
 
 
 @jit_within_rows
-def _bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
-    """Add the modes' response to what the cubic through N lacks, whose slope at the end of the step is known."""
-    lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), places(marks)
-    drives = leaks + 1
-    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    _changes(marks, c, weights, NODES - 1, state)
-    for i in range(lanes):
-        for j in range(NODES):
-            of_cubic = END_SLOPES[j] * state[(at.g + j * drives + leaks) * lanes + i]
-            state[at.scratch * lanes + i] -= of_cubic
-    for k in range(m):
-        p = (k + 1) * weights_of(marks).mode - 1
-        for i in range(lanes):
-            state[(SOURCES + k) * lanes + i] += weights[p * wide + i * each] * state[at.scratch * lanes + i]
-
-
-@jit_within_rows
 def _fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """Add what is left of what `smooth` has taken, and the modes' response to it by N and, as one, by the leaks."""
     lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
@@ -205,9 +188,19 @@ def end_bent(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatA
 
     They follow from xi there, on the tangents at the last node.
     """
-    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    lanes, leaks, at, rows = len(marks.lanes), len(marks.leaks), places(marks), weights_of(marks)
     drives, last = leaks + 1, NODES - 1
-    _bend_end(marks, c, weights, state)
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    # The modes' response to what the cubic through N lacks, whose slope at the end of the step is known.
+    _changes(marks, c, weights, last, state)
+    for i in range(lanes):
+        for j in range(NODES):
+            of_cubic = END_SLOPES[j] * state[(at.g + j * drives + leaks) * lanes + i]
+            state[at.scratch * lanes + i] -= of_cubic
+    for k in range(len(marks.modes)):
+        p = (k + 1) * rows.mode - 1
+        for i in range(lanes):
+            state[(SOURCES + k) * lanes + i] += weights[p * wide + i * each] * state[at.scratch * lanes + i]
     if fades:
         _fade(marks, c, weights, state)
     project(marks, c, 1, at.xi, state)
@@ -294,20 +287,12 @@ def _end_of_stack(marks: Any, c: Any, weights: FloatArray, fades: bool, state: F
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     _add_kinks(marks, c, weights, state)
     project(marks, c, 1, at.xi, state)
+    if len(marks.mobile) > 0:
+        _drives_under_mobile(marks, c, weights, 0, state)
     for t in range(leaks):
         for i in range(lanes):
-            state[(at.g + t) * lanes + i] = state[(at.g + (len(marks.inner) + 1) * leaks + t) * lanes + i]
-            state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
-
-
-@jit_within_rows
-def _end_under_mobile(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatArray) -> None:
-    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    _add_kinks(marks, c, weights, state)
-    project(marks, c, 1, at.xi, state)
-    _drives_under_mobile(marks, c, weights, 0, state)
-    for t in range(leaks):
-        for i in range(lanes):
+            if len(marks.mobile) == 0:
+                state[(at.g + t) * lanes + i] = state[(at.g + (len(marks.inner) + 1) * leaks + t) * lanes + i]
             state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
 
 
@@ -318,7 +303,7 @@ _drives_at_node = jit_by_kind(
     StackMarks=_drives_of_stack, MobileMarks=_drives_under_mobile, NetworkMarks=bent_drives_at
 )  # fmt: skip
 # From the modes at the end of a step, xi and the drives there, for the start of the next one.
-_end = jit_by_kind(StackMarks=_end_of_stack, MobileMarks=_end_under_mobile, NetworkMarks=end_bent)
+_end = jit_by_kind(StackMarks=_end_of_stack, MobileMarks=_end_of_stack, NetworkMarks=end_bent)
 
 
 def _step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: FloatArray, a: float, b: float) -> None:
@@ -353,13 +338,10 @@ step = jit_by_kind(
 
 @jit_within_rows
 def _at_node(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
-    _predict(marks, weights, j, state)
-    _drives_at_node(marks, c, weights, j, state)
+    """xi at node j, and what 1/A - q0 multiplies there, from the start of the step and the drives at earlier nodes.
 
-
-@jit_within_rows
-def _predict(marks: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
-    """xi at node j, and what 1/A - q0 multiplies there, from the start of the step and the drives at earlier nodes."""
+    From these follow the drives there.
+    """
     lanes, active, leaks = len(marks.lanes), len(marks.active), len(marks.leaks)
     at, rows = places(marks), weights_of(marks)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
@@ -373,6 +355,7 @@ def _predict(marks: Any, weights: FloatArray, j: int, state: FloatArray) -> None
             for n in range(j * (leaks + len(marks.bend))):
                 x += weights[(first + 2 + active + n) * wide + i * each] * state[(at.g + n) * lanes + i]
             state[to * lanes + i] = x
+    _drives_at_node(marks, c, weights, j, state)
 
 
 @jit_within_rows
@@ -400,48 +383,41 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
 
 
 @jit_within_rows
-def _add_kinks_to(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArray) -> None:
-    """Add the response of mode k, which decays fast, to what the cubics miss of the drives' kinks.
+def _add_kinks(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
+    """Add the response of modes that decay fast to what the cubics miss of the drives' kinks.
 
     These begin at th with a straight line and a square, to which the response is known.
     """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives, inner = leaks + len(marks.bend), len(marks.inner)
+    drives, inner, rows = leaks + len(marks.bend), len(marks.inner), weights_of(marks)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    x, p = at.scratch, k * weights_of(marks).mode + inner + 5
-    for i in range(lanes):
-        th, length = state[(x + 4) * lanes + i], weights[weights_of(marks).length * wide + i * each]
-        y, rest = max(c.rates[k] * length, QUICK), 1.0 - th
-        over = 1.0 / y
-        size = state[x * lanes + i] if c.rates[k] * length >= QUICK else 0.0
-        # The decay from th on, as the 64th power of a series.
-        v = min(y * rest, 40.0) / 64.0
-        left = 1.0 - v * (1.0 - 0.5 * v * (1.0 - THIRD * v * (1.0 - 0.25 * v * (1.0 - 0.2 * v * (1.0 - SIXTH * v)))))
-        for _ in range(6):
-            left *= left
-        straight = (rest - (1.0 - left) * over) * over
-        square = (rest * rest - 2.0 * straight) * over
-        for t in range(drives):
-            w = state[(at.w + t if t < leaks else 0) * lanes + i]
-            rise = state[(at.w + leaks + t if t < leaks else 1) * lanes + i]
-            rise -= w
-            w += th * rise
-            more = c.feed[k, t] * length * (w * straight + rise * square)
-            for j in range(1, inner + 2):
-                since = max(PLACES[inner - 1, j] - th, 0.0)
-                more -= weights[(p + j * drives + t) * wide + i * each] * since * (w + rise * since)
-            state[(SOURCES + k) * lanes + i] += c.kinks[t] * size * more
-
-
-@jit_within_rows
-def _add_kinks(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
-    count, first = len(marks.lanes) if len(marks.own) > 0 else 1, weights_of(marks).length
     for k in range(len(marks.modes)):
-        quick = False
-        for i in range(count):
-            quick = quick or c.rates[k] * weights[first * count + i] >= QUICK
-        if quick:
-            _add_kinks_to(marks, c, k, weights, state)
+        x, p, quick = at.scratch, k * rows.mode + inner + 5, False
+        for i in range(wide):
+            quick = quick or c.rates[k] * weights[rows.length * wide + i] >= QUICK
+        for i in range(lanes if quick else 0):
+            th, length = state[(x + 4) * lanes + i], weights[rows.length * wide + i * each]
+            y, rest = max(c.rates[k] * length, QUICK), 1.0 - th
+            over = 1.0 / y
+            size = state[x * lanes + i] if c.rates[k] * length >= QUICK else 0.0
+            # The decay from th on, as the 64th power of a series.
+            v = min(y * rest, 40.0) / 64.0
+            left = 1.0 - 0.25 * v * (1.0 - 0.2 * v * (1.0 - SIXTH * v))
+            left = 1.0 - v * (1.0 - 0.5 * v * (1.0 - THIRD * v * left))
+            for _ in range(6):
+                left *= left
+            straight = (rest - (1.0 - left) * over) * over
+            square = (rest * rest - 2.0 * straight) * over
+            for t in range(drives):
+                w = state[(at.w + t if t < leaks else 0) * lanes + i]
+                rise = state[(at.w + leaks + t if t < leaks else 1) * lanes + i]
+                rise -= w
+                w += th * rise
+                more = c.feed[k, t] * length * (w * straight + rise * square)
+                for j in range(1, inner + 2):
+                    since = max(PLACES[inner - 1, j] - th, 0.0)
+                    more -= weights[(p + j * drives + t) * wide + i * each] * since * (w + rise * since)
+                state[(SOURCES + k) * lanes + i] += c.kinks[t] * size * more
 
 
 @jit_within_rows

@@ -15,7 +15,7 @@ import math
 import threading
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -57,28 +57,6 @@ def _scratch(name: str, *shape: int) -> FloatArray:
     if name not in kept or kept[name].size < size:
         kept[name] = np.empty(size)
     return np.asarray(kept[name][:size].reshape(shape))
-
-
-class Judged(NamedTuple):
-    """Errors that are seen of a block, without safety."""
-
-    errors: FloatArray  # (4,): Of gap voltage (V), force (N), nodes (V) and charges (C)
-    alone: float  # Error of xi (V) that a single piece makes
-    alike: FloatArray  # (m,): Errors of the modes that the block hands on, as if they were alike
-    chance: FloatArray  # (m, m): Products of two, as if they came by chance
-
-
-class _Window(NamedTuple):
-    """What steps half as long change in a window of every piece."""
-
-    # z, off (rows, pieces, width + 1): States of the steps that are checked, and the differences; 0 in pieces that are
-    # not checked
-    z: FloatArray
-    off: FloatArray
-    # source, xi (pieces, width + 1): V
-    source: FloatArray
-    xi: FloatArray
-    took: FloatArray  # (pieces,): Durations, s
 
 
 class Block:
@@ -174,10 +152,16 @@ class Block:
         lane = (self.n - 1) // self.count
         return np.array(self.kept[:, lane, self.n - lane * self.count])
 
-    def judge(self, parts: int, peak: float, alike: FloatArray, chance: FloatArray) -> Judged:
-        """Errors of the block, followed in `parts` steps a sample, with those at its start; `peak` is of |xi|, V."""
-        form, c, window, active, m = self.form, self.form.lanes, self._check(parts), self.active, self.m
-        y, of_window = (self.rates[:, None] * took for took in (self.lengths, np.maximum(window.took, 1e-30)))
+    def judge(self, parts: int, peak: float, alike: FloatArray, chance: FloatArray) -> None:
+        """Errors, without safety, of the block as followed in `parts` steps a sample; `peak` is of |xi|, V.
+
+        Those of gap voltage (V), force (N), nodes (V) and charges (C) go into `errors` (4,), that of xi (V) in a single
+        piece into `alone`. With errors of the modes at the start (m,), as if they were alike, and products of two
+        (m, m), as if they came by chance, `alike` and `chance` take those at the end.
+        """
+        form, c, (z, off, window), active, m = self.form, self.form.lanes, self._check(parts), self.active, self.m
+        took = self.h[window[:, :-1]].sum(axis=1) if self.own else np.full(PIECES, self.width * self.h[0])
+        y, of_window = (self.rates[:, None] * t for t in (self.lengths, np.maximum(took, 1e-30)))
         # What a piece adds over what its window does, if all errors are alike, and of products of two, if they come by
         # chance.
         share, of_products = (
@@ -186,14 +170,13 @@ class Block:
         if not form.bent:
             # Nothing of passive modes decays: other windows add less than the one where the source moves most.
             share[active:], of_products[active:, active:] = self.busy
-        own = window.off[:m, :, -1]
+        own = off[:m, :, -1]
         products = own[:, None] * own
         handed, lucky = self._handed_on(own * share, alike), self._handed_on(products * of_products, chance)
         last = (self.n - 1) // self.count
-        alike, chance = handed[:, last + 1], lucky[..., last + 1]
-        handed, lucky = handed[:, :-1], lucky[..., :-1]
         # What the sweeps leave of the starts is left of the end, too.
-        alike = alike + np.copysign(self.left / OF_FORCE, alike)
+        self.alike = handed[:, last + 1] + np.copysign(self.left / OF_FORCE, handed[:, last + 1])
+        self.chance, handed, lucky = lucky[..., last + 1], handed[:, :-1], lucky[..., :-1]
 
         def added(columns: FloatArray, left: FloatArray) -> FloatArray:
             """Of sums of the modes (C, m): by chance, or by errors that are alike where chance does not explain them.
@@ -210,9 +193,9 @@ class Block:
         # An error that a fast mode brings into a piece changes the force as much as xi at the first sample allows.
         decay = np.exp(-self.rates[:, None] * (self.h[self.first] if self.own else self.h))
         later = added(c.shape[None], decay * np.ones(own.shape))[0]
-        alone = np.abs(np.einsum("k,kij->ij", c.shape, window.off[:m])).max()
-        alone += np.abs(c.shape @ (own * (share - 1.0))).max()
-        return Judged(self._errors(window, over, later, 1e-9 * peak + 1e-300), float(alone), alike, chance)
+        alone = np.abs(np.einsum("k,kij->ij", c.shape, off[:m])).max()
+        self.alone = float(alone + np.abs(c.shape @ (own * (share - 1.0))).max())
+        self.errors = self._errors(z[:m], off, window, over, later, 1e-9 * peak + 1e-300)
 
     def _handed_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
         """What is there at the start of each piece and at the end (*kinds, pieces + 1), of modes or of products of two.
@@ -225,12 +208,14 @@ class Block:
         hand_on(left.reshape(-1, PIECES), added.reshape(-1, PIECES), before.ravel(), out)
         return out.reshape(*before.shape, PIECES + 1)
 
-    def _errors(self, window: _Window, over: FloatArray, later: FloatArray, least: float) -> FloatArray:
-        """Errors as in `Judged` from those of xi and of what `LaneForm.judged` shows, and of xi after the first sample.
-
-        Shape (1 + C, pieces) and (pieces,); `least` is the least |xi| (V) at which slopes are taken.
-        """
+    def _errors(
+        self, z: FloatArray, off: FloatArray, window: IntArray, over: FloatArray, later: FloatArray, least: float
+    ) -> FloatArray:
+        """`errors` from windows as in `_check`, from errors of xi and of what `LaneForm.judged` shows (1 + C, pieces),
+        and of xi after the first sample (pieces,); `least` is the least |xi| (V) at which slopes are taken."""
         form, c, shown, (over, *others) = self.form, self.form.lanes, self.form.judged, over
+        source, before = self.x[window], self.xi[window]
+        xi = before + np.einsum("k,kij->ij", form.xi[1:], off)
         top = np.maximum(self.peaks, least)
         first = np.maximum(np.abs(self.xi[self.first]) + over, least)
         rises, rises_at_first = ((form.force(1.001 * xi) - form.force(xi)) / (1e-3 * xi) for xi in (top, first))
@@ -246,29 +231,32 @@ class Block:
         else:
             e, of_inverse = 1.0 / inverse - 1.0 / c.q0, np.zeros(PIECES)
             u, moved = (np.abs(x / (1.0 + c.kappa * e)).max(axis=0) for x in (1.0, e))
-        xi = window.xi + np.einsum("k,kij->ij", form.xi[1:], window.off)
         of_force = np.maximum(rises_at_first * over, rises * later)
         errors = [
-            (np.abs(of(xi) - of(window.xi)).max(axis=1) + more).max()
+            (np.abs(of(xi) - of(before)).max(axis=1) + more).max()
             for of, more in ((form.gap, u * over), (form.force, of_force))
         ]
-        found = np.einsum("ck,kij->cij", shown.columns, window.off[: self.m])
+        found = np.einsum("ck,kij->cij", shown.columns, off[: self.m])
         more = np.reshape(others, (-1, PIECES))
         if shown.by_area.any():
-            whole = np.einsum("ck,kij->cij", shown.columns, window.z[: self.m])
+            whole = np.einsum("ck,kij->cij", shown.columns, z)
             other = form.inverse_area(xi)
-            changed = other * found + (other - form.inverse_area(window.xi)) * whole
+            changed = other * found + (other - form.inverse_area(before)) * whole
             found = np.where(shown.by_area[:, None, None], changed, found)
             largest = np.abs(whole).max(axis=-1)
             more = np.where(shown.by_area[:, None], more * u * c.q0 + largest * of_inverse * over, more)
         if shown.bends.any():
-            found += shown.bends[:, None, None] * (form.moved(xi, window.source) - form.moved(window.xi, window.source))
+            found += shown.bends[:, None, None] * (form.moved(xi, source) - form.moved(before, source))
         found = np.abs(found).max(axis=-1, initial=0.0) + (more + np.abs(shown.bends)[:, None] * moved * over)
         nodes = shown.k.size - form.flows
         return np.array([*errors, found[:nodes].max(initial=0.0), found[nodes:].max(initial=0.0)])
 
-    def _check(self, parts: int) -> _Window:
-        """Follow windows of every piece by twice as many steps: at large moves of the source, under N at large |xi|."""
+    def _check(self, parts: int) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Follow a window of every piece by twice as many steps: at large moves of the source, under N at large |xi|.
+
+        The states there, what the steps change of them (rows, pieces, width + 1), which is 0 in pieces that are not
+        checked, and the samples' numbers (pieces, width + 1).
+        """
         most, width, lanes = self.moves.T, self.width, np.arange(PIECES)
         # Windows end before the last sample.
         most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
@@ -285,24 +273,21 @@ class Block:
             largest = np.argmax(np.abs(self.xi[:-1]).reshape(PIECES, self.count), axis=1)
             largest = np.minimum(largest - width // 2, ends)
             places.append(np.where(place >= 0, np.maximum(largest, 0), -1))
-        off, z, at, inside = np.empty(0), np.empty(0), lanes, np.arange(width + 1)
-        for number, place in enumerate(places):
-            first = np.maximum(place, 0)
-            coarse = self.kept[:, lanes[:, None], first[:, None] + inside]
+        found: list[tuple[FloatArray, FloatArray, IntArray]] = []
+        for place in places:
+            inside = np.maximum(place, 0)[:, None] + np.arange(width + 1)
+            coarse = self.kept[:, lanes[:, None], inside]
             fine = np.empty(coarse.shape)
             fine[..., 0] = coarse[..., 0]
-            self._span(self.first + first, width, 2 * parts, -1.0, fine)
-            found = fine - coarse
-            found[:, place < 0] = 0.0
-            if number == 0:
-                off, z, at = found, coarse, first
-                continue
-            in_xi, before = (np.abs(np.einsum("k,kij->ij", self.form.xi[1:], x)).max(axis=1) for x in (found, off))
-            worse = in_xi > before
-            off[:, worse], z[:, worse], at[worse] = found[:, worse], coarse[:, worse], first[worse]
-        inside = (at + self.first)[:, None] + inside
-        took = self.h[inside[:, :-1]].sum(axis=1) if self.own else np.full(PIECES, width * self.h[0])
-        return _Window(z, off, self.x[inside], self.xi[inside], took)
+            self._span(self.first + inside[:, 0], width, 2 * parts, -1.0, fine)
+            fine -= coarse
+            fine[:, place < 0] = 0.0
+            found.append((coarse, fine, self.first[:, None] + inside))
+        if len(found) > 1:
+            first, second = (np.abs(np.einsum("k,kij->ij", self.form.xi[1:], off)).max(axis=1) for _, off, _ in found)
+            for one, other in zip(*found, strict=True):
+                one[..., second > first, :] = other[..., second > first, :]
+        return found[0]
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
         """Source (V; n,) and states (rows, n) `since` (s) after samples with these numbers, in `parts` steps."""

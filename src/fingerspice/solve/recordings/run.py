@@ -18,7 +18,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.lanes.loops import flow, show
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.block import OF_FORCE, Block, Judged, Piece, driving, pieces_of, ready, spacing_of
+from fingerspice.solve.recordings.block import OF_FORCE, Block, Piece, driving, pieces_of, ready, spacing_of
 from fingerspice.solve.recordings.form import PIECES, LaneForm
 from fingerspice.solve.runs import Progress, Run, closed_form, excess_of
 from fingerspice.waveforms.sampling import on_grid
@@ -120,10 +120,10 @@ class LaneMarch:
         tries = self.steps == 0 and self.rtol < AT_ONCE[self.form.bent] and values.size > 4 * FIRST
         for size in (FIRST, values.size - 1)[0 if tries else 1 :]:
             block = Block(self.form, values[: size + 1], h[:size], self.steps == 0)
-            seen, excess = self._climb(block, LEAST_AT_START if piece.grows else LEAST_PEAK)
+            excess = self._climb(block, LEAST_AT_START if piece.grows else LEAST_PEAK)
         parts, self.peak = PARTS[self.level], max(float(block.peaks.max()), self.peak)
-        self.errors = np.maximum(seen.errors, self.errors)
-        self.alike, self.chance, self.margin = seen.alike, seen.chance, min(self.margin, block.margin)
+        self.errors = np.maximum(block.errors, self.errors)
+        self.alike, self.chance, self.margin = block.alike, block.chance, min(self.margin, block.margin)
         self.steps += parts * block.n
         self._write(piece, block, parts, t_out, out)
         self.z, self.t, self.u_last = block.end(), piece.stop, float(values[-1])
@@ -132,8 +132,8 @@ class LaneMarch:
         elif excess < COARSER and self.level > 0:
             self.level -= 1
 
-    def _climb(self, block: Block, share: float) -> tuple[Judged, float]:
-        """Solve a block, with ever more steps until its error is met; the errors, and the excess of those stated."""
+    def _climb(self, block: Block, share: float) -> float:
+        """Solve a block, with ever more steps until its error is met; the excess of the errors stated."""
         form = self.form
         while True:
             parts, excess = PARTS[self.level], math.inf
@@ -148,16 +148,16 @@ class LaneMarch:
                 if not (near and block.on_one_branch and form.gap(np.array(peak)) <= form.u_top):
                     raise LostError
                 peak = max(peak, self.peak)
-                seen = block.judge(parts, peak, self.alike, self.chance)
-                gaps, _, _ = self._stated(np.maximum(seen.errors, self.errors), peak)
+                block.judge(parts, peak, self.alike, self.chance)
+                gaps, _, _ = self._stated(np.maximum(block.errors, self.errors), peak)
                 # Errors are related to a share of the largest gap voltage to expect at least.
                 least = max(self.least, share * self.expected)
                 gaps[0, :2] = np.maximum(gaps[0, :2], [least, float(form.force(np.array(least)))])
                 excess = excess_of(gaps, self.problem.rounding) / self.rtol
                 if self.share < 1.0:
-                    excess = max(excess, SAFETY * seen.alone / (self.share * self.rtol * max(peak, self.least)))
+                    excess = max(excess, SAFETY * block.alone / (self.share * self.rtol * max(peak, self.least)))
                 if excess <= 1.0:
-                    return seen, excess
+                    return excess
             self.refused += parts * block.n
             if self.level + 1 == len(PARTS):
                 raise NotMetError
