@@ -155,7 +155,7 @@ def test_directives_without_effect_are_listed_once() -> None:
 
 
 def test_a_title_that_reads_like_a_statement_is_warned_about() -> None:
-    for title in ("R1 a 0 5", "V1 a 0 SIN(0 1 2)", "Xg a b area GAP d=1u", ".tran 1u 1m"):
+    for title in ("R1 a 0 5", "V1 a 0 SIN(0 1 2)", "V1 a 0 triangle(1 2)", "Xg a b area GAP d=1u", ".tran 1u 1m"):
         assert "reads like a statement" in parse_deck(f"{title}\nR9 a 0 1\n").warnings[0]
     for title in ("Resistive coating in air", "Xray of the skin", "* a comment", "..."):
         assert parse_deck(f"{title}\nR9 a 0 1\n").warnings == []

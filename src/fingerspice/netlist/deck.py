@@ -18,6 +18,7 @@ from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.expressions import Bare, Call, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
 from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, OTHERS, Deck, Statement, Subcircuit
+from fingerspice.netlist.sources import SOURCES
 from fingerspice.waveforms.waveform import refuse
 
 LONGEST_TITLE = 200  #: Characters of a title that are shown; the middle of a longer title is left out.
@@ -26,8 +27,7 @@ MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
-_TITLE = re.compile(r"^\.title\s+", re.IGNORECASE)
-_VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
+_VALUE = rf"(?:\{{|'|[-+.\d]|(?:dc|ac|sine|{'|'.join(SOURCES)})\b)"
 _STATEMENT = re.compile(  #: Titles that are probably the netlist's first statement.
     rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}|x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)"
     rf"|(?:{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
@@ -45,7 +45,7 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
     refuse(len(text) > MAX_BYTES, f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
     refuse("\0" in text, f"'{deck.file}' is not text (it holds NUL characters)")
     title, *lines = deck.split(text.removeprefix("\ufeff"))
-    deck.title = printable(_TITLE.sub("", title.strip()), LONGEST_TITLE)
+    deck.title = printable(re.sub(r"(?i)^\.title\s+", "", title.strip()), LONGEST_TITLE)
     if _STATEMENT.match(deck.title):
         problem = f"the first line is the title, but '{deck.title}' reads like a statement: add a title above"
         deck.warn(problem, Where(deck.file, 1))
