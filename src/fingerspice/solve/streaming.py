@@ -26,6 +26,7 @@ from fingerspice.solve.problem import Problem, at_breakpoints, check_length, che
 from fingerspice.solve.recordings.run import LaneMarch, LostError, prepared
 from fingerspice.solve.runs import Run
 from fingerspice.solve.simulation import check_arguments, integrated, own_rtol, solution_of, state_error
+from fingerspice.solve.starting import as_shown
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import on_breakpoint
 from fingerspice.waveforms.waveform import require
@@ -114,22 +115,21 @@ class Stream:
 
     def go_to(self, mark: Mark, done: int) -> None:
         """Continue a stream from its mark, after `done` outputs; allowed before this stream's first chunk only."""
-        self._written, self.done = mark["written"], done
-        if self._march is not None and "march" in mark:
-            self._march.stand(mark["march"])
+        kept = {name: np.array(value) if isinstance(value, list) else value for name, value in mark.items()}
+        self._written, self.done = kept.pop("written"), done
+        if self._march is not None and "gaps" not in kept:
+            vars(self._march).update(kept)
         else:
-            kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
-            gaps, self._march = np.array(mark["gaps"], float).reshape(-1, 4), None
+            gaps, self._march = kept.pop("gaps").reshape(-1, 4), None
             self._last = replace(self._last, state=State(**kept), gaps=gaps)
         if done > self._written:
             self._take(done - self._written)
 
     def _here(self) -> Mark:
         """The mark of the state reached."""
-        if self._march is not None:
-            return {"written": self._written, "march": self._march.mark()}
-        state = {k: np.asarray(v).tolist() for k, v in vars(self._last.state).items()}
-        return {"written": self._written, "state": state, "gaps": self._last.gaps.tolist()}
+        last = self._last
+        kept = {**vars(last.state), "gaps": last.gaps} if self._march is None else self._march.mark()
+        return {"written": self._written} | {name: np.asarray(value).tolist() for name, value in kept.items()}
 
     @property
     def _over(self) -> bool:
@@ -182,13 +182,8 @@ class Stream:
         if run.gaps.shape == self._last.gaps.shape:
             run.gaps = np.maximum(run.gaps, self._last.gaps)
         self._last, self._written = run, self._written + run.t.size
-        record = run.record(problem)
-        shown, n = whole.scene.shown.network, record.network.k.shape[0]
-        if len(shown.cells) == len(record.network.cells):
-            return t[: run.t.size], record.rows
         # In the form of exponential steps, whichever method has computed them.
-        place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
-        return t[: run.t.size], np.column_stack([record.u_layer[:, place], record.rows[:, n:]])
+        return t[: run.t.size], run.rows if run.by_layer else as_shown(whole.scene, run.rows)
 
     def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
         problem = self.problem

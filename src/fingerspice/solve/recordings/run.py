@@ -242,13 +242,8 @@ class LaneMarch:
         return np.array([[u, force, u_error, f_error]]), node_error, charge_error
 
     def mark(self) -> dict[str, Any]:
-        """The state of the integration as plain data, which `stand` restores in another march through the same run."""
-        return {name: np.asarray(getattr(self, name)).tolist() for name in self._MARKED}
-
-    def stand(self, mark: dict[str, Any]) -> None:
-        """Restore the state of another march through the same run."""
-        for name, value in mark.items():
-            setattr(self, name, np.array(value) if isinstance(value, list) else value)
+        """The state of the integration: attributes, which another march through the same run may be given."""
+        return {name: getattr(self, name) for name in self._MARKED}
 
     def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
         """The run so far, with the given outputs."""
