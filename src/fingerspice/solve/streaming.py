@@ -115,7 +115,7 @@ class Stream:
 
     def go_to(self, mark: Mark, done: int) -> None:
         """Continue a stream from its mark, after `done` outputs; allowed before this stream's first chunk only."""
-        kept = {name: np.array(value) if isinstance(value, list) else value for name, value in mark.items()}
+        kept: Mark = {name: np.array(value) if isinstance(value, list) else value for name, value in mark.items()}
         self._written, self.done = kept.pop("written"), done
         if self._march is not None and "gaps" not in kept:
             vars(self._march).update(kept)
@@ -138,7 +138,7 @@ class Stream:
 
     def _take(self, count: int) -> tuple[FloatArray, FloatArray]:
         """The next `count` outputs, or fewer where the run ends before: times (s) and rows."""
-        found = []
+        found: list[tuple[FloatArray, FloatArray]] = []
         while count > 0 and (self._rest is not None or not self._over):
             before, t, rows = self._rest or (
                 self._here(), *(self._window() if self._march is None else self._piece(self._march)),
@@ -146,8 +146,10 @@ class Stream:
             found.append((t[:count], rows[:count]))
             self._rest = (before, t[count:], rows[count:]) if t.size > count else None
             count -= t.size
-        t, rows = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        return t, rows
+        if len(found) == 1:
+            return found[0]
+        # The numbers of a column stay together in memory, as they are read.
+        return np.concatenate([t for t, _ in found]), np.concatenate([rows.T for _, rows in found], axis=1).T
 
     def _piece(self, march: LaneMarch) -> tuple[FloatArray, FloatArray]:
         """Times (s) and rows of the next piece of a recording."""
