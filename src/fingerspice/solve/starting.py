@@ -79,11 +79,12 @@ def from_loop(scene: Scene, t: float, y: FloatArray, before: float, u_gap: float
 
 
 def as_shown(scene: Scene, row: FloatArray) -> FloatArray:
-    """A row as in `Record` with a voltage for each layer in place of each cell, as in `Scene.shown`."""
+    """A row as in `Record`, or several, with a voltage for each layer in place of each cell, as in `Scene.shown`."""
     if scene.network.stack is None or scene.shown is scene:
         return row
     n = scene.turn.size
-    return np.append(scene.shown.turn * (scene.network.stack.grouping @ (scene.turn * row[:n])), row[n:])
+    live = scene.shown.turn * ((scene.turn * row[..., :n]) @ scene.network.stack.grouping.T)
+    return np.concatenate([live, row[..., n:]], axis=-1)
 
 
 def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> State:

@@ -26,6 +26,7 @@ from fingerspice.solve.problem import Problem, at_breakpoints, check_length, che
 from fingerspice.solve.recordings.run import LaneMarch, LostError, prepared
 from fingerspice.solve.runs import Run
 from fingerspice.solve.simulation import check_arguments, integrated, own_rtol, solution_of, state_error
+from fingerspice.solve.starting import as_shown
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import on_breakpoint
 from fingerspice.waveforms.waveform import require
@@ -77,19 +78,17 @@ class Stream:
 
     def __init__(self, problem: Problem, plan: Plan, outputs: Outputs, count: int, rtol: float, method: str) -> None:
         self.problem, self.plan, self.outputs, self.count, self.rtol = problem, plan, outputs, count, rtol
-        self.done = 0
-        # Outputs integrated so far; the times (s) and rows of those that no chunk has contained yet; and the states
-        # before the pieces that these come from.
-        self._written = 0
-        self._t, self._rows = np.empty(0), np.empty((0, max(problem.initial.y.size, 1)))
-        self._marks: list[Mark] = []
-        # Of a recording that is followed sample by sample: its pieces, the number of the next one, and its march.
+        # Outputs in the chunks returned so far, and outputs integrated. Of the latest piece: the state before it, and
+        # the times (s) and rows that no chunk has contained yet; None where there are none.
+        self.done, self._written = 0, 0
+        self._rest: tuple[Mark, FloatArray, FloatArray] | None = None
+        # Of a recording that is followed sample by sample.
         own, by_samples = own_rtol(problem, plan, rtol), method == "auto" and plan.tier == "coupled"
-        self._pieces, form = (prepared(problem, own) if by_samples else None) or ([], None)
-        self._place, self._march = 0, None if form is None else LaneMarch(problem, form, own)
+        found = prepared(problem, own) if by_samples else None
+        self._march = None if found is None else LaneMarch(problem, *found, own)
         # Of a run in windows, such as what the method for recordings fails on: the method asked for, and the one used
         # and the run of the last window.
-        self._asked, self._method = (method, method) if form is None else ("exponential", "relaxation")
+        self._asked, self._method = (method, method) if found is None else ("exponential", "relaxation")
         self._last = Run(*_NO_OUTPUTS, Status.SUCCESS, 0, {}, problem.initial)
 
     def __iter__(self) -> Iterator[Solution]:
@@ -103,79 +102,72 @@ class Stream:
         if self.done == self.outputs.total:
             raise StopIteration
         wanted = min(self.count, self.outputs.total - self.done)
-        self._reach(self.done + wanted)
         solution = self._solution(*self._take(wanted))
         if solution.failure is not None:
             self.done = self.outputs.total
             raise SolveError(solution.failure, solution)
         self.done += wanted
-        self._marks = self._marks[sum(mark["written"] <= self.done for mark in self._marks) - 1 :]
         return solution
 
     def mark(self) -> Mark:
         """The state before the piece that contains the next chunk's first output, as plain data; see `go_to`."""
-        return [mark for mark in (*self._marks, self._here()) if mark["written"] <= self.done][-1]
+        return self._here() if self._rest is None else self._rest[0]
 
     def go_to(self, mark: Mark, done: int) -> None:
         """Continue a stream from its mark, after `done` outputs; allowed before this stream's first chunk only."""
-        self._written, self.done = mark["written"], done
-        if self._march is not None and "march" in mark:
-            self._place = mark["place"]
-            self._march.stand(mark["march"])
+        kept: Mark = {name: np.array(value) if isinstance(value, list) else value for name, value in mark.items()}
+        self._written, self.done = kept.pop("written"), done
+        if self._march is not None and "gaps" not in kept:
+            vars(self._march).update(kept)
         else:
-            kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
-            gaps, self._march = np.array(mark["gaps"], float).reshape(-1, 4), None
+            gaps, self._march = kept.pop("gaps").reshape(-1, 4), None
             self._last = replace(self._last, state=State(**kept), gaps=gaps)
-        self._reach(done + 1)
-        self._take(done - mark["written"])
+        if done > self._written:
+            self._take(done - self._written)
 
     def _here(self) -> Mark:
         """The mark of the state reached."""
-        if self._march is not None:
-            return {"written": self._written, "place": self._place, "march": self._march.mark()}
-        state = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self._last.state).items()}
-        return {"written": self._written, "state": state, "gaps": self._last.gaps.tolist()}
+        last = self._last
+        kept = {**vars(last.state), "gaps": last.gaps} if self._march is None else self._march.mark()
+        return {"written": self._written} | {name: np.asarray(value).tolist() for name, value in kept.items()}
 
     @property
     def _over(self) -> bool:
         """Whether the run has reached its end, or failed."""
         return self._last.status is not Status.SUCCESS or self._written == self.outputs.total
 
-    def _reach(self, written: int) -> None:
-        """Integrate pieces until so many outputs are there, or the run ends."""
-        found = [(self._t, self._rows)] if self._t.size else []
-        before = len(found)
-        while self._written < written and not self._over:
-            self._marks.append(self._here())
-            found.append(self._window() if self._march is None else self._piece(self._march))
-        if len(found) > before:
-            self._t, self._rows = (np.concatenate(parts) for parts in zip(*found, strict=True))
-
     def _take(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Take the next `count` outputs, or all if there are fewer: times (s) and rows."""
-        t, rows = self._t[:count], self._rows[:count]
-        self._t, self._rows = self._t[count:], self._rows[count:]
-        return t, rows
+        """The next `count` outputs, or fewer where the run ends before: times (s) and rows."""
+        found: list[tuple[FloatArray, FloatArray]] = []
+        while count > 0 and (self._rest is not None or not self._over):
+            before, t, rows = self._rest or (
+                self._here(), *(self._window() if self._march is None else self._piece(self._march)),
+            )  # fmt: skip
+            found.append((t[:count], rows[:count]))
+            self._rest = (before, t[count:], rows[count:]) if t.size > count else None
+            count -= t.size
+        if len(found) == 1:
+            return found[0]
+        # The numbers of a column stay together in memory, as they are read.
+        return np.concatenate([t for t, _ in found]), np.concatenate([rows.T for _, rows in found], axis=1).T
 
     def _piece(self, march: LaneMarch) -> tuple[FloatArray, FloatArray]:
         """Times (s) and rows of the next piece of a recording."""
-        piece, o, last = self._pieces[self._place], self.outputs, self._place + 1 == len(self._pieces)
+        piece, o = march.pieces[march.place], self.outputs
         # All outputs up to the end of the piece, and a few more.
         end = math.ceil((piece.stop - o.start) / o.spacing) - o.low + 2
-        t = run_at = o.times(self._written, o.total if last else max(end, self._written))
+        t = run_at = o.times(self._written, max(end, self._written))
         if o.rate is None:
             run_at = at_breakpoints(replace(self.problem, t_start=piece.start, t_stop=piece.stop), t)
         out = march.outputs_at(run_at)
         try:
-            march.follow(piece, run_at, out)
+            march.follow(run_at, out)
         except LostError:
             # The state before this piece.
             self._last, self._march = replace(self._last, state=march.state), None
             return self._window()
-        if last:
-            march.finish(run_at, out)
         count = march.outputs
-        self._written, self._place = self._written + count, self._place + 1
+        self._written += count
         return t[:count], march.form.recorded(self.problem, out[:, :count])
 
     def _window(self) -> tuple[FloatArray, FloatArray]:
@@ -192,13 +184,8 @@ class Stream:
         if run.gaps.shape == self._last.gaps.shape:
             run.gaps = np.maximum(run.gaps, self._last.gaps)
         self._last, self._written = run, self._written + run.t.size
-        record = run.record(problem)
-        shown, n = whole.scene.shown.network, record.network.k.shape[0]
-        if len(shown.cells) == len(record.network.cells):
-            return t[: run.t.size], record.rows
         # In the form of exponential steps, whichever method has computed them.
-        place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
-        return t[: run.t.size], np.column_stack([record.u_layer[:, place], record.rows[:, n:]])
+        return t[: run.t.size], run.rows if run.by_layer else as_shown(whole.scene, run.rows)
 
     def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
         problem = self.problem
@@ -207,7 +194,7 @@ class Stream:
             state_error(problem, run, self.plan, self.rtol)
         else:
             run = replace(self._last.only(np.zeros(self._last.t.size, bool)), continuous=None)
-        if self._t.size or not self._over:
+        if self._rest is not None or not self._over:
             # A failure concerns a later chunk if outputs before it are still waiting for their chunk.
             run.status, run.t_failed = Status.SUCCESS, None
         shown = problem.scene.shown

@@ -67,17 +67,18 @@ class LaneMarch:
 
     # What changes from piece to piece.
     _MARKED = (
-        "t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak", "margin",
+        "place", "t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak", "margin",
         "z", "alike", "chance", "errors",
     )  # fmt: skip
 
-    def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
+    def __init__(self, problem: Problem, pieces: list[Piece], form: LaneForm, rtol: float, share: float = 1.0) -> None:
         # The error allowed is reduced to a `share` where errors of earlier pieces add up.
         self.problem, self.form, self.rtol, self.share = problem, form, rtol, share
+        self.pieces, self.place = pieces, 0  # The next piece is number `place`
         _, wave = driving(problem)
         assert wave is not None
         # Time reached (s), and largest |U| of the source so far, V.
-        self.wave, self.usual, self.t, self.loudest = wave, spacing_of(wave), problem.t_start, 0.0
+        self.wave, self.t, self.loudest = wave, problem.t_start, 0.0
         # Of a source of current the scene knows no peak.
         self.expected = form.gain * (problem.scene.u_peak or wave.peak(0.0, problem.t_stop))
         self.least = max(float(np.abs(problem.initial.y).max(initial=0.0)), LEAST_PEAK * self.expected)
@@ -101,12 +102,13 @@ class LaneMarch:
         self.outputs = 0
         return np.empty((self.form.rows.k.size + self.form.flows, t_out.size))
 
-    def follow(self, piece: Piece, t_out: FloatArray, out: FloatArray) -> None:
-        """Integrate a piece, and write the outputs before its end as rows of `out`; a `LostError` where it cannot.
+    def follow(self, t_out: FloatArray, out: FloatArray) -> None:
+        """Integrate the next piece, and write the outputs before its end as rows of `out`; `LostError` where it cannot.
 
-        Of a piece that grows, all steps lie on one line of the source, and become longer from a part of the shortest
-        time constant on.
+        After the last piece the outputs at the end of the run follow. Of a piece that grows, all steps lie on one line
+        of the source, and become longer from a part of the shortest time constant on.
         """
+        piece = self.pieces[self.place]
         values = piece.values(self.wave)
         self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
         if piece.grows:
@@ -131,6 +133,9 @@ class LaneMarch:
             self.level = 0
         elif excess < COARSER and self.level > 0:
             self.level -= 1
+        self.place += 1
+        if self.place == len(self.pieces):
+            self._finish(t_out, out)
 
     def _climb(self, block: Block, share: float) -> float:
         """Solve a block, with ever more steps until its error is met; the excess of the errors stated."""
@@ -176,7 +181,7 @@ class LaneMarch:
             on_grid(t, piece.start, piece.spacing, slack) if times is None else np.abs(t - times[:-1]).max() <= slack
         ):
             slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.flows else block.x
-            self._show(block.x, slope, block.first, block.kept, block.xi[:n], out)
+            self._show(block.x, slope, block.kept, out, block.first, block.xi[:n])
             return
         samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
         number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
@@ -184,19 +189,17 @@ class LaneMarch:
         since = t - samples[number]
         since[np.abs(since) <= slack] = 0.0
         x, z = block.at(number, np.clip(since, 0.0, length), length, parts)
-        self._show_at(x, (block.x[number + 1] - block.x[number]) / length, z, out)
-
-    def _show_at(self, x: FloatArray, slope: FloatArray, z: FloatArray, out: FloatArray) -> None:
-        """Write outputs as `_show`, from states (rows, n)."""
-        n, xi, kept = x.size, np.empty(x.size), z[:, None]
-        show(self.form.xi[None], x, _ONE_ROW, n, 0, n, kept, xi[None])
-        self._show(x, slope, _ONE_ROW, kept, xi, out)
+        self._show(x, (block.x[number + 1] - block.x[number]) / length, z[:, None], out)
 
     def _show(
-        self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, xi: FloatArray, out: FloatArray
+        self, x: FloatArray, slope: FloatArray, kept: FloatArray, out: FloatArray, first: IntArray = _ONE_ROW,
+        xi: FloatArray | None = None,
     ) -> None:  # fmt: skip
         """Write the next outputs into columns of `out`: from source, slope (V/s), states as in `Block`, and xi (n,)."""
-        form, n, shown, start = self.form, xi.size, self.form.rows, self.outputs
+        form, shown, start, n = self.form, self.form.rows, self.outputs, x.size if xi is None else xi.size
+        if xi is None:
+            xi = np.empty(n)
+            show(form.xi[None], x, first, n, 0, n, kept, xi[None])
         count, charges, self.outputs = n if first.size == 1 else int(first[1]), len(shown.k) - form.flows, start + n
         show(form.shown, x, first, count, start, n, kept, out)
         rows = out[:, start : self.outputs]
@@ -211,14 +214,14 @@ class LaneMarch:
         for by, share, own in zip(form.shown[charges:], shown.bends[charges:], rows[len(shown.k) :], strict=True):
             flow(form.lanes, by, float(share), x, slope, first, count, kept, xi, own)
 
-    def finish(self, t_out: FloatArray, out: FloatArray) -> None:
+    def _finish(self, t_out: FloatArray, out: FloatArray) -> None:
         """Write the outputs at the end of the run, with the source's slope after it."""
-        count, after = t_out.size - self.outputs, 1e-3 * self.usual
+        count, after = t_out.size - self.outputs, 1e-3 * spacing_of(self.wave)
         if count:
             x, slope = np.full(count, self.u_last), np.zeros(count)
             if self.form.flows:
                 slope += float(np.diff(self.wave.value([self.problem.t_stop, self.problem.t_stop + after]))[0]) / after
-            self._show_at(x, slope, np.repeat(self.z[:, None], count, axis=1), out)
+            self._show(x, slope, np.repeat(self.z[:, None, None], count, axis=2), out)
 
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
         """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C)."""
@@ -239,13 +242,8 @@ class LaneMarch:
         return np.array([[u, force, u_error, f_error]]), node_error, charge_error
 
     def mark(self) -> dict[str, Any]:
-        """The state of the integration as plain data, which `stand` restores in another march through the same run."""
-        return {name: np.asarray(getattr(self, name)).tolist() for name in self._MARKED}
-
-    def stand(self, mark: dict[str, Any]) -> None:
-        """Restore the state of another march through the same run."""
-        for name, value in mark.items():
-            setattr(self, name, np.array(value) if isinstance(value, list) else value)
+        """The state of the integration: attributes, which another march through the same run may be given."""
+        return {name: getattr(self, name) for name in self._MARKED}
 
     def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
         """The run so far, with the given outputs."""
@@ -268,13 +266,12 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None) -> Ru
     found, refused, t_out = prepared(problem, rtol), 0, problem.t_out
     if found is None:
         return None
-    pieces, form = found
     for share in BEGINNINGS:
-        march = LaneMarch(problem, form, rtol, share)
+        march = LaneMarch(problem, *found, rtol, share)
         out = march.outputs_at(t_out)
         try:
-            for piece in pieces:
-                march.follow(piece, t_out, out)
+            while march.place < len(march.pieces):
+                march.follow(t_out, out)
                 if progress is not None:
                     progress(problem.done(march.t))
         except NotMetError:
@@ -282,8 +279,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None) -> Ru
             continue
         except LostError:
             return None
-        march.finish(t_out, out)
-        run = march.run(t_out, problem.left, form.recorded(problem, out))
+        run = march.run(t_out, problem.left, march.form.recorded(problem, out))
         run.stats["rejected"] += refused
         # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
         if excess_of(run.gaps, problem.rounding) <= rtol:
