@@ -27,10 +27,9 @@ MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
-_VALUE = rf"(?:\{{|'|[-+.\d]|(?:dc|ac|sine|{'|'.join(SOURCES)})\b)"
 _STATEMENT = re.compile(  #: Titles that are probably the netlist's first statement.
-    rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}|x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)"
-    rf"|(?:{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
+    rf"[rcvi]\w*\s+\S+\s+\S+\s+(?:\{{|'|[-+.\d]|(?:dc|ac|sine|{'|'.join(SOURCES)})\b)"
+    rf"|(?:x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})|{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
     re.IGNORECASE,
 )
 

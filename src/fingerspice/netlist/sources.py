@@ -105,6 +105,7 @@ SOURCES: Mapping[str, Function] = {
     "wavefile": Function(_wavefile, "WAVEFILE(path gain [channel]) with gain in V at full scale"),
     "table": Function(_table, "TABLE(path [time_column value_column]) or TABLE(path rate=RATE)"),
 }  # fmt: skip
+_WORDS = {function: inspect.signature(function.make).parameters for function in SOURCES.values()}
 _MISSING = {"path": "names no file", "gain": "has no gain, the V at full scale"}
 _KNOWN = ", ".join(name.upper() for name, function in SOURCES.items() if not function.refused)
 _LEVELS = {"dc": "DC value", "ac": "AC [magnitude [phase]]"}  #: What is no source function, with what is allowed.
@@ -197,7 +198,7 @@ def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
 
 def _made(function: Function, call: Call, context: Context) -> Waveform:
     """The waveform of a call, whose words become the arguments of a source function."""
-    name, given, taken = call.text.upper(), len(call.args), inspect.signature(function.make).parameters
+    name, given, taken = call.text.upper(), len(call.args), _WORDS[function]
     listed = [key for key, p in taken.items() if p.kind <= p.POSITIONAL_OR_KEYWORD]
     named = [key for key, p in taken.items() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     needed = sum(taken[key].default is inspect.Parameter.empty and key not in _MISSING for key in listed)

@@ -328,7 +328,7 @@ def mode_error(
     for p in range(4):
         off[p, k] = magnified * miss[rows[p]] * missed
         places[p + 1] = carried[p] + magnified * left[p] + off[p, k]
-    brief[1], brief[2], brief[3] = between(tables.lobes, x.w[k])
+    brief[0], (brief[1], brief[2], brief[3]), brief[4] = 0.0, between(tables.lobes, x.w[k]), 0.0
 
 
 @jit_rows
