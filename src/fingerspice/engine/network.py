@@ -22,7 +22,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.numerics import chebyshev
-from fingerspice.numerics.modes import copy_to
+from fingerspice.numerics.modes import copy_to, solve
 from fingerspice.physics.contact import inverse_area
 
 
@@ -184,38 +184,6 @@ def on_branch(mobile: bool, curve: FloatArray, sign: float, u: float) -> tuple[f
 
 
 @jit
-def solve_in_place(matrix: FloatArray, x: FloatArray) -> bool:
-    """matrix^-1 x into x by elimination with row pivoting; False where the determinant is not positive."""
-    n = x.size
-    positive = True
-    for column in range(n):
-        pivot = column
-        for row in range(column + 1, n):
-            if abs(matrix[row, column]) > abs(matrix[pivot, column]):
-                pivot = row
-        if pivot != column:
-            positive = not positive
-            x[column], x[pivot] = x[pivot], x[column]
-            for j in range(column, n):
-                matrix[column, j], matrix[pivot, j] = matrix[pivot, j], matrix[column, j]
-        if not abs(matrix[column, column]) > 0.0:
-            return False
-        if matrix[column, column] < 0.0:
-            positive = not positive
-        for row in range(column + 1, n):
-            factor = matrix[row, column] / matrix[column, column]
-            if factor != 0.0:
-                for j in range(column + 1, n):
-                    matrix[row, j] -= factor * matrix[column, j]
-                x[row] -= factor * x[column]
-    for row in range(n - 1, -1, -1):
-        for j in range(row + 1, n):
-            x[row] -= matrix[row, j] * x[j]
-        x[row] /= matrix[row, row]
-    return positive
-
-
-@jit
 def _voltages(net: Net, room: Room, y: FloatArray, k: FloatArray) -> None:
     """Cell voltages from the state and the sources in `room`, and their rates."""
     for cell in range(room.u.size):
@@ -326,7 +294,7 @@ def rates(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, out
     capacitances(net, room, y, sign)
     room.k[:] = 0.0
     residual(net, room, jump, y, sign, room.k, out)
-    if not solve_in_place(room.matrix, out[:n]):
+    if not solve(room.matrix, out[:n].reshape(n, 1)) > 0.0:
         return False
     # The charges' rates need the voltages' own.
     residual(net, room, jump, y, sign, out, room.probe)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, IntArray, aligned
 from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
 from fingerspice.numerics.chebyshev import to_powers
-from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES, multiply
+from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES
 from fingerspice.numerics.modes import copy_to
 
 CONTROL = np.dtype([
@@ -193,22 +193,6 @@ def end_at(theta: float, x: Modal, error: FloatArray) -> None:
     for k in range(w0.size):
         w0[k] = at(w[k], basis)
         error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
-
-
-@jit_rows
-def layers(
-    mobile: bool, area0: float, k_shown: FloatArray, shown: FloatArray, w: FloatArray, source: FloatArray,
-    q: FloatArray, values: FloatArray,
-) -> None:  # fmt: skip
-    """Recorded voltages at all rows."""
-    multiply(shown, w, None, values)
-    for i in range(shown.shape[0]):
-        if mobile:
-            for j in range(ROWS):
-                values[i, j] *= area0 * q[j]
-        share = k_shown[i]
-        for j in range(ROWS):
-            values[i, j] += share * source[j]
 
 
 @jit_rows

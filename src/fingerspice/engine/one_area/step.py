@@ -23,7 +23,7 @@ from fingerspice.engine.one_area.charge import charge_step
 from fingerspice.engine.one_area.model import dot, turns_at_zero
 from fingerspice.engine.one_area.rows import DQ, GUESS, SCRATCH, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.one_area.system import System
-from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS, SECOND, THIRD, multiply
+from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS, SECOND, THIRD, combine, multiply
 from fingerspice.numerics.modes import apply
 
 # A gap voltage below this fraction of the one at the next node counts as 0.
@@ -251,33 +251,25 @@ def _node_error(c: OneArea, level: int) -> float:
     Under `mobile` the voltages are the modes times 1/A: their error contains that of A, and the interpolation error of
     the product.
     """
-    system, r, w, places, brief = c.system, c.work.r, c.work.modal.w, c.work.modal.places, c.work.modal.brief
-    node, k_node, gap, area0 = system.node[level], system.k_node, system.gap[level], system.model.area0
+    system, r, x, node_s = c.system, c.work.r, c.work.modal, c.system.k_node[:, np.newaxis]
+    area0, gap, n = system.model.area0, system.gap[level], x.w.shape[0]
     if not system.model.mobile:
-        return exponential.node_error(node, k_node[:, np.newaxis], places, c.work.off)
-    own, missed, values = np.zeros((places.shape[0], N_PLACES)), np.zeros(N_PLACES), np.zeros(ROWS)
-    moved = np.zeros(N_PLACES)
+        return exponential.node_error(system.node[level], node_s, x.places, c.work.off)
+    own, values, moved = np.zeros((n, N_PLACES)), np.zeros(ROWS), np.zeros(N_PLACES)
     for p in range(N_PLACES):
         row = readout.row_of(p)
-        for k in range(gap.size):
-            own[k, p] = area0 * r[Q, row] * places[k, p] - area0 * r[Q, row] * brief[k, p]
+        scale = area0 * r[Q, row]
+        for k in range(n):
+            own[k, p] = scale * (x.places[k, p] - x.brief[k, p])
             moved[p] += gap[k] * own[k, p]
         moved[p] *= area0 * r[DQ, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
-    worst = 0.0
-    for i in range(k_node.size):
+    for k in range(n):
         for j in range(ROWS):
-            values[j] = 0.0
-            for k in range(gap.size):
-                values[j] += node[i, k] * w[k, j]
-            values[j] *= area0 * r[Q, j]
-            values[j] += k_node[i] * r[SOURCE, j]
-        missed[1], missed[2], missed[3] = between(c.tables.lobes, values)
+            values[j] = area0 * r[Q, j] * x.w[k, j]
+        missed = between(c.tables.lobes, values)
         for p in range(N_PLACES):
-            total = missed[p]
-            for k in range(gap.size):
-                total += node[i, k] * (own[k, p] + moved[p] * w[k, readout.row_of(p)])
-            worst = max(worst, abs(total))
-    return worst
+            own[k, p] += moved[p] * x.w[k, readout.row_of(p)] + (missed[p - 1] if 0 < p < N_PLACES - 1 else 0.0)
+    return exponential.node_error(system.node[level], node_s, own, c.work.off)
 
 
 @jit_within
@@ -321,7 +313,11 @@ def _finish(c: OneArea, charge: bool, s: LoopState, t: float) -> None:
     n_shown = shown.shape[0]
     if charge:
         charge_step(c, s, values[n_shown], values[n_shown + 1])
-    readout.layers(model.mobile, model.area0, system.k_shown, shown, x.w, r[SOURCE], r[Q], values)
+    multiply(shown, x.w, None, values)
+    for i in range(n_shown if model.mobile else 0):
+        for j in range(ROWS):
+            values[i, j] *= model.area0 * r[Q, j]
+    combine(system.k_shown[:, np.newaxis], r[SOURCE : SOURCE + 1], 0, values)
     readout.write_step(s, t, x)
     control.magnified = max(control.magnified, step.grown)
     for i in range(ROWS):
