@@ -22,11 +22,8 @@ from fingerspice.numerics.modes import copy_to
 CONTROL = np.dtype([
     ("t", float),  # s
     ("h", float),  # s: length of the next step
-    ("sign", float),  # Of the gap voltage, on the branch of the area
     ("u_before", float),  # V: source before `t`
     ("u_gap", float),  # V
-    ("branch_start", float),  # s
-    ("branch_length", float),  # s: of the branch before; infinite before the first
     ("too_long", float),  # s: a length that was rejected recently
     ("h_after_edge", float),  # s: the first step taken after an edge of the source
     ("magnified", float),  # Largest change of the gap voltage for a change of 1 V of a state voltage
@@ -389,9 +386,10 @@ STEP = np.dtype([
     ("t_new", float),  # s: reached at that fraction
     ("step_error", float),  # V: of the step, which controls its length
     ("grown", float),  # Largest ratio of a move of the gap voltage to the move of a state voltage
-    ("start", float),  # s: of the source's segment at hand
-    ("edge", float),  # s: its end
-    ("since", float),  # s: time since its start
+    ("start", float),  # s: the last edge of a source, or 0 within a jump of a network's sources
+    ("edge", float),  # s: end of a stack's segment that starts there
+    ("since", float),  # s: time since `start`
+    ("reached", float),  # s: that at the end of the step
     ("stop", float),  # s: end of the step's range
     ("begun", float),  # s: since which evaluations are counted
     ("below", float),  # Fraction of the step at which the gap voltage dips off its branch, or 0
@@ -427,6 +425,10 @@ class LoopState(NamedTuple):
     y: FloatArray  # State voltages (V), areas with a time constant, and charges (C)
     # Estimated error of the modes, signed; of a stack, then the number of the reference area that they belong to
     error: FloatArray
+    # sign, branch (n_area,) and (n_area, 2): Of each area the sign of the gap voltage on its branch (0: to be chosen);
+    # the time at which the branch began, and the length of the branch before, infinite before the first, s
+    sign: FloatArray
+    branch: FloatArray
     # control, counters: Bookkeeping, see `engine.collocation.readout`
     control: Control
     counters: IntArray
@@ -445,12 +447,9 @@ class LoopState(NamedTuple):
 
 
 @jit_within
-def may_shorten(s: LoopState, since: float) -> bool:
-    """Let a quarter be tried of a step that starts at a zero and is on neither branch; False where it is rounding.
-
-    The rounding of its length is relative to the time `since` (s).
-    """
-    if s.step[0].length <= 1e-13 * max(since, 1e-3 * (s.step[0].stop - s.control[0].t)):
+def may_shorten(s: LoopState) -> bool:
+    """Let a quarter be tried of a step that starts at a zero and is on neither branch; False where it is rounding."""
+    if s.step[0].length <= 1e-13 * max(s.step[0].since, 1e-3 * (s.step[0].stop - s.control[0].t)):
         return False
     s.counters[REJECTED] += 1
     s.control[0].h, s.step[0].flips = 0.25 * s.step[0].length, 0

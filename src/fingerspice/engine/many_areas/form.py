@@ -109,7 +109,7 @@ class Jump(NamedTuple):
     # control (2,), sign: Bookkeeping before the jump and at its start, and branches of the areas before it
     control: NDArray[Any]
     sign: FloatArray
-    branch: FloatArray  # (n_area, 2): `ManyAreas.branch` before it; within a jump it goes by the fraction of the jump
+    branch: FloatArray  # (n_area, 2): `LoopState.branch` before it; within a jump it goes by the fraction of the jump
 
 
 class Work(NamedTuple):
@@ -236,7 +236,7 @@ def evaluate_many(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool
     With `probing`, the modes are not those of the step at hand, and other rows are taken, so that those of the step
     stay as they are. False beyond a fold.
     """
-    form, work, sign, h, several = form_of(c, s), c.work, c.sign, s.step[0].length, s.step[0].several > 0
+    form, work, sign, h, several = form_of(c, s), c.work, s.sign, s.step[0].length, s.step[0].several > 0
     # Derivatives of stiff modes, blocks of rows, and the distance to the fold.
     d, cells, areas, least = work.d, work.cells, work.areas, work.room[3]
     if probing:

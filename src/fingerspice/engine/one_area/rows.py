@@ -204,7 +204,7 @@ def evaluate_one(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool)
     stay as they are. False where, under `mobile`, the area equation was not solved on the branch connected to the guess
     of the gap voltage.
     """
-    system, level, sign, tapped = c.system, s.step[0].level, s.control[0].sign, c.work.tapped
+    system, level, sign, tapped = c.system, s.step[0].level, s.sign[0], c.work.tapped
     model, r = system.model, c.work.spare_r if probing else c.work.r
     mobile, q0 = model.mobile, system.q0[level]
     if probing:

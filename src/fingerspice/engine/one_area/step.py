@@ -76,7 +76,7 @@ def begin(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
     apply(c.system.project[step.level], s.y, c.work.modal.w0)
     length = step.stop - step.start
     step.length = step_control.choose_step(
-        pace, model.tau, model.coupled, c.sources.series.shape[1] > 0, t, length - step.since, control
+        pace, model.tau, c.sources.series.shape[1] > 0, s.branch, length - step.since, control
     )  # fmt: skip
     return readout.GO_ON
 
@@ -88,7 +88,8 @@ def _enter_segment(c: OneArea, pace: Pace, s: LoopState) -> bool:
     # Time is counted from the edge: a transient after it may be faster than the rounding of t.
     step.since = control.t - step.start
     step.begun, step.evaluated = control.t, s.counters[readout.NFEV]
-    if not step_control.enter(c.system.model, pace.charge, source_voltage(c, s, step.since), s.y, control):
+    u = source_voltage(c, s, step.since)
+    if not step_control.enter(c.system.model, pace.charge, u, s.y, control, s.sign, s.branch):
         return False
     # Try the step that was right after the edge before: similar jumps often need similar steps.
     control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
@@ -112,7 +113,7 @@ def _take_level(c: OneArea, s: LoopState) -> None:
     if system.q0.size > 1:
         q = s.control[0].last_q
         if step.fresh == step_control.AFTER_EDGE or not q > 0.0:
-            q, _ = on_branch(system.model.mobile, system.model.curve, s.control[0].sign, s.control[0].u_gap)
+            q, _ = on_branch(system.model.mobile, system.model.curve, s.sign[0], s.control[0].u_gap)
         now = step_control.nearest_level(system.q0, q)
     if now == step.level:
         return
@@ -129,7 +130,7 @@ def _take_level(c: OneArea, s: LoopState) -> None:
 def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
     system, x, step, control, counters = c.system, c.work.modal, s.step[0], s.control[0], s.counters
-    model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.control[0].sign
+    model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.sign[0]
     h, u_rows = step.length, r[U]
     if h != step.tabled:
         exponential.take_tables(c, s, level, h, system.rates[level], system.gap[level])
@@ -154,7 +155,7 @@ def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
         if turns_at_zero(model, r[X_GAP, 0], -sign):
             control.margin = 0.0
             return readout.NO_STEP
-        return flip(s)
+        return step_control.turn(s, 0)
     step.below = step_control.dip(u_rows, sign, tol, step.wrong, x.coefficients[0]) if model.coupled and closed else 0.0
     if 0.0 < step.below < POINTS[1] and at_zero:
         # The gap voltage starts at a zero and soon returns to it: a shorter step resolves this.
@@ -211,14 +212,6 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
 
 
 @jit_within
-def flip(s: LoopState) -> int:
-    """Change the branch of the area, and start again."""
-    s.control[0].sign = -s.control[0].sign
-    s.step[0].flips += 1
-    return readout.AGAIN
-
-
-@jit_within
 def refuse(c: OneArea, s: LoopState) -> int:
     """Why no shorter step would do after one that was rejected; GO_ON if one may."""
     system, step, r = c.system, s.step[0], c.work.r
@@ -241,7 +234,7 @@ def beyond(c: OneArea, pace: Pace, s: LoopState) -> float:
     There the branch of the area has no meaning, and the error says nothing.
     """
     wrong, u = s.step[0].wrong, c.work.r[U]
-    return 1.1 * POINTS[wrong] if wrong > 1 and s.control[0].sign * u[END] < c.system.lo else 2.0
+    return 1.1 * POINTS[wrong] if wrong > 1 and s.sign[0] * u[END] < c.system.lo else 2.0
 
 
 @jit
@@ -273,41 +266,17 @@ def _node_error(c: OneArea, level: int) -> float:
 
 
 @jit_within
-def complete(c: OneArea, pace: Pace, s: LoopState) -> int:
-    """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
-    step, control, t = s.step[0], s.control[0], s.control[0].t
-    h, since, length = step.length, step.since, step.stop - step.start
-    reached = since + h
-    step.theta, step.crossed = 1.0, -1
-    if reached >= length or length - reached <= 1e-12 * h:
-        reached = length
-        step.theta = min(1.0, (length - since) / h)
-    if step.wrong > 0 or step.below > 0.0:
-        crossing = step_control.zero(c.work.r[U], control.sign, step.wrong, step.below, c.work.modal.coefficients[0])
-        if since + crossing * h <= since:
-            if step.flips < 2:
-                return flip(s)
-            if step_control.farthest_off(c.work.r[U], control.sign, step.theta) > pace.tol and readout.may_shorten(
-                s, since
-            ):
-                return readout.AGAIN
-        elif since + crossing * h <= reached and crossing <= step.theta:
-            step.theta, reached, step.crossed = crossing, since + crossing * h, 0
-    step.flips = 0
-    step.t_new = step.stop if reached == length else step.start + reached
-    _finish(c, pace.charge, s, t)
-    if step.crossed >= 0 and not _cross(c, s):
-        return readout.NO_STEP
-    control.t, step.since = step.t_new, reached
-    if control.t >= step.stop:
-        control.u_before = source_voltage(c, s, control.t - step.start)
-    s.counters[readout.ACCEPTED] += 1
-    return readout.OUT_OF_RANGE if s.peaks[0, readout.PEAK_U] > c.system.u_top else readout.GO_ON
+def crossing(c: OneArea, pace: Pace, s: LoopState, a: int) -> float:
+    """Fraction of an accepted step at which the gap voltage leaves its branch, or 2."""
+    wrong, below = s.step[0].wrong, s.step[0].below
+    if wrong == 0 and below == 0.0:
+        return 2.0
+    return float(step_control.zero(c.work.r[U], s.sign[0], wrong, below, c.work.modal.coefficients[0]))
 
 
 @jit_within
-def _finish(c: OneArea, charge: bool, s: LoopState, t: float) -> None:
-    """Charge, outputs, peaks and errors of a step that began at t (s), and the state at its end or where it is cut."""
+def finish(c: OneArea, charge: bool, s: LoopState) -> int:
+    """Charge, outputs, peaks and errors of a step, and the state at its end or where it is cut."""
     system, r, step, control, x, y = c.system, c.work.r, s.step[0], s.control[0], c.work.modal, s.y
     model, shown, values, theta = system.model, system.shown[step.level], x.values, step.theta
     n_shown = shown.shape[0]
@@ -318,7 +287,7 @@ def _finish(c: OneArea, charge: bool, s: LoopState, t: float) -> None:
         for j in range(ROWS):
             values[i, j] *= model.area0 * r[Q, j]
     combine(system.k_shown[:, np.newaxis], r[SOURCE : SOURCE + 1], 0, values)
-    readout.write_step(s, t, x)
+    readout.write_step(s, control.t, x)
     control.magnified = max(control.magnified, step.grown)
     for i in range(ROWS):
         r[SCRATCH, i] = 1.0 / r[Q, i]
@@ -334,28 +303,12 @@ def _finish(c: OneArea, charge: bool, s: LoopState, t: float) -> None:
     control.last_q = readout.at(r[Q], x.basis)
     control.u_gap = 0.0 if step.crossed >= 0 else readout.at(r[U], x.basis)
     apply(system.live[step.level], x.w0, y)
-
-
-@jit_within
-def _cross(c: OneArea, s: LoopState) -> bool:
-    """Change the branch at a zero of the gap voltage, which ends a step; False at a fold there."""
-    step, control, model, t_new = s.step[0], s.control[0], c.system.model, s.step[0].t_new
-    control.sign = -control.sign
-    control.branch_length, control.branch_start = t_new - control.branch_start, t_new
-    s.counters[readout.ZEROS] += 1
-    if turns_at_zero(model, dot(model.gap, s.y), control.sign):
-        control.t = t_new
-        control.sign = -control.sign
-        control.margin = 0.0
-        return False
-    # The area has a kink here, which excites fast modes again: the first step is chosen as after other zeros.
-    if step.below > 0.0:
-        # The gap voltage returns to 0 V soon.
-        control.h, control.allowed = 2.0 * (step.below - step.theta) * step.length, 0.0
-    elif control.h_after_zero > 0.0:
-        control.h, control.allowed = control.h_after_zero, 0.0
-    step.fresh = step_control.AFTER_ZERO
-    return True
+    if step.crossed >= 0 and turns_at_zero(model, dot(model.gap, y), -s.sign[0]):
+        control.t, control.margin = step.t_new, 0.0
+        return readout.NO_STEP
+    if step.t_new >= step.stop:
+        control.u_before = source_voltage(c, s, step.t_new - step.start)
+    return readout.OUT_OF_RANGE if s.peaks[0, readout.PEAK_U] > system.u_top else readout.GO_ON
 
 
 @jit_within
