@@ -119,12 +119,12 @@ def look(looks: Looks, s: LoopState) -> bool:
 Circuit = OneArea | ManyAreas
 # The parts of a step, which both kinds of circuits have: begin a call of the loop; find where the next step starts, and
 # the length to try first; solve a step of that length, and estimate its error; tell why no shorter step would do after
-# one that was rejected (GO_ON if one may); the fraction of it at which the next one should end, if it went far beyond a
-# zero, or 2; the fraction of an accepted one at which the gap voltage of an area leaves its branch, or 2; write its
-# outputs, account for its errors, and take the state at its end; end a call.
-_start, _begin, _attempt, _refuse, _beyond, _crossing, _finish, _end = (
+# one that was rejected (GO_ON if one may), and whether it went far beyond a zero; the fraction of an accepted one at
+# which the gap voltage of an area leaves its branch, or 2; write its outputs, account for its errors, and take the
+# state at its end; end a call.
+_start, _begin, _attempt, _refuse, _crossing, _finish, _end = (
     jit_by_kind(OneArea=getattr(stack, part), ManyAreas=getattr(network, part))
-    for part in ("start", "begin", "attempt", "refuse", "beyond", "crossing", "finish", "end")
+    for part in ("start", "begin", "attempt", "refuse", "crossing", "finish", "end")
 )
 
 
@@ -219,12 +219,11 @@ def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
             return readout.GO_ON
         step.tries += 1
         counters[readout.REJECTED] += 1
-        code = _refuse(circuit, state)
+        code = _refuse(circuit, pace, state)
         if code != readout.GO_ON:
             return code
-        reach = _beyond(circuit, pace, state)
-        if reach < 2.0:
-            step.length = rung(h * min(0.9, reach))
+        if step.too_far < 2.0:
+            step.length = rung(h * min(0.9, step.too_far))
         else:
             step.length = step.wanted = shorten(h, factor, control)
 

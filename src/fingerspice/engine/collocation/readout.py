@@ -393,6 +393,7 @@ STEP = np.dtype([
     ("stop", float),  # s: end of the step's range
     ("begun", float),  # s: since which evaluations are counted
     ("below", float),  # Fraction of the step at which the gap voltage dips off its branch, or 0
+    ("too_far", float),  # Fraction of a rejected step at which the next one should end; see `refuse`
     ("is_paused", np.int64),
     ("index", np.int64),  # Of the source's segment
     ("level", np.int64),  # Of the reference area

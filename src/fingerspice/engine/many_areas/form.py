@@ -183,13 +183,6 @@ def mode_rates(
 
 
 @jit_rows
-def clear(rows: FloatArray) -> None:
-    for c in range(rows.shape[0]):
-        for i in range(ROWS):
-            rows[c, i] = 0.0
-
-
-@jit_rows
 def _inverted(q: FloatArray, dq: FloatArray, slopes_too: bool) -> None:
     """The area and, if wanted, its slope in place of 1/A and the slope of that."""
     for i in range(ROWS):
@@ -250,7 +243,7 @@ def evaluate_many(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool
     eta, rho = cells[ETA], cells[RHO]
     area, slope, rate, more = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE]
     multiply(form.gap, w, areas[U_S], areas[U])
-    clear(pull)
+    pull[:] = 0.0
     if stiff:
         mode_rates(h, rates, w, lin, pull, True, d)
     for a in range(form.cell.size):

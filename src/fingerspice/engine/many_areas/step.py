@@ -271,8 +271,8 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
         slopes = pace.charge or step.smooth == 0
         forms.source_rows(c.sources, work.segment, t, h, slopes, work.room, work.s, work.ds)
     forms.follow_sources(form, work)
-    forms.clear(x.guess)
-    forms.clear(work.cells[forms.RHO])
+    x.guess[:] = 0.0
+    work.cells[forms.RHO] = 0.0
     exponential.free(c.tables.decay[step.slot], x.w0, x.w)
     exponential.respond(work.lin, c.tables.phi[step.slot], x.w, x.base)
     passes, closed, answer = exponential.converge(c, s, 0.3 * tol)
@@ -293,9 +293,19 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
 
 
 @jit
-def refuse(c: ManyAreas, s: LoopState) -> int:
-    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
-    step, t = s.step[0], s.control[0].t
+def refuse(c: ManyAreas, pace: Pace, s: LoopState) -> int:
+    """Why no shorter step would do after one that was rejected; GO_ON if one may.
+
+    `too_far` is set to the fraction of it at which the next one should end, soon after a zero far beyond which it went,
+    as there the branch of an area has no meaning, and the error says nothing; or to 2.
+    """
+    form, u, step, t = c.form, c.work.modal.u, s.step[0], s.control[0].t
+    step.too_far = 2.0
+    for a in range(s.sign.size):
+        if form.cell[a] >= 0 and s.sign[a] * u[a, END] < form.lo[a]:
+            found = step_control.first_wrong(u[a], s.sign[a], pace.tol)
+            if found > 1 and 1.1 * POINTS[found] < 1.0:
+                step.too_far = min(step.too_far, 1.1 * POINTS[found])
     step.unconverged += int(step.converged == 0)
     # The error of a shorter step says nothing about the length at which the iteration converges.
     step.trusted = step.converged
@@ -304,21 +314,6 @@ def refuse(c: ManyAreas, s: LoopState) -> int:
     # A step of this length is rounding of the time: if it is rejected, there is a singularity.
     lost = step.length <= 1e-13 * max(abs(t), 1e-3 * (step.stop - t))
     return readout.NO_STEP if stuck or lost or (step.whole > 0 and 1.0 / step.grown < _NEAR_FOLD) else readout.GO_ON
-
-
-@jit
-def beyond(c: ManyAreas, pace: Pace, s: LoopState) -> float:
-    """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
-
-    There the branch of an area has no meaning, and the error says nothing.
-    """
-    form, u, end = c.form, c.work.areas[forms.U], 1.0
-    for a in range(s.sign.size):
-        if form.cell[a] >= 0 and s.sign[a] * u[a, END] < form.lo[a]:
-            found = step_control.first_wrong(u[a], s.sign[a], pace.tol)
-            if found > 1:
-                end = min(end, 1.1 * POINTS[found])
-    return end if end < 1.0 else 2.0
 
 
 @jit_within
@@ -337,7 +332,7 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
     """
     form, work, spare = c.form, c.work, c.work.spare_cells
     _take_coupling(c, s, 0.0)
-    forms.clear(spare[forms.ETA])
+    spare[forms.ETA] = 0.0
     multiply(work.own.held, work.modal.w[: form.shape.shape[0]], None, spare[forms.CHI])
     combine(work.own.from_slopes, work.s, 0, spare[forms.CHI])
     forms.answer_mobile(form, work, s.step[0].several > 0, spare, work.areas, work.room[3])

@@ -212,10 +212,15 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
 
 
 @jit_within
-def refuse(c: OneArea, s: LoopState) -> int:
-    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
+def refuse(c: OneArea, pace: Pace, s: LoopState) -> int:
+    """Why no shorter step would do after one that was rejected; GO_ON if one may.
+
+    `too_far` is set to the fraction of it at which the next one should end, soon after a zero far beyond which it went,
+    as there the branch of an area has no meaning, and the error says nothing; or to 2.
+    """
     system, step, r = c.system, s.step[0], c.work.r
-    model = system.model
+    model, wrong = system.model, step.wrong
+    step.too_far = 1.1 * POINTS[wrong] if wrong > 1 and s.sign[0] * r[U, END] < system.lo else 2.0
     # A step rejected beyond the end of the area's polynomial: shorter ones would creep up to the kink there.
     if model.coupled and abs(s.control[0].u_gap) > 0.9 * system.u_top and rows.largest_size(r[U]) > system.u_top:
         return readout.OUT_OF_RANGE
@@ -225,16 +230,6 @@ def refuse(c: OneArea, s: LoopState) -> int:
     if model.mobile and 1.0 - model.area0 * r[X_GAP, 0] * r[DQ, 0] < _NEAR_FOLD:
         return readout.NO_STEP
     return readout.GO_ON
-
-
-@jit_within
-def beyond(c: OneArea, pace: Pace, s: LoopState) -> float:
-    """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
-
-    There the branch of the area has no meaning, and the error says nothing.
-    """
-    wrong, u = s.step[0].wrong, c.work.r[U]
-    return 1.1 * POINTS[wrong] if wrong > 1 and s.sign[0] * u[END] < c.system.lo else 2.0
 
 
 @jit
