@@ -26,20 +26,9 @@ from fingerspice.numerics.modes import copy_to, solve
 from fingerspice.physics.contact import inverse_area
 
 
-class Segment(NamedTuple):
-    """The source between two breakpoints."""
-
-    # start, length: Seconds
-    start: float
-    length: float
-    # (k, 6): c, n, a, omega, phi, beta of c tau^n exp(a tau) cos(phi + omega tau + beta tau^2 / 2), tau from the start
-    terms: FloatArray
-    series: FloatArray  # (l,): Chebyshev coefficients over the segment, or empty
-
-
 @jit
 def term_at(term: FloatArray, tau: float) -> tuple[float, float]:
-    """Value and slope of one term of a `Segment`, tau seconds into it."""
+    """Value and slope of one term of a segment, tau seconds into it; see `source`."""
     value, slope, n, a = term[0], 0.0, term[1], term[2]
     if n == 1.0:
         slope = value
@@ -61,18 +50,22 @@ def term_at(term: FloatArray, tau: float) -> tuple[float, float]:
 
 
 @jit
-def source(segment: Segment, tau: float) -> tuple[float, float]:
-    """Source voltage (V) and its slope (V/s), tau seconds into a segment."""
+def source(terms: FloatArray, series: FloatArray, length: float, tau: float) -> tuple[float, float]:
+    """Source voltage (V) and its slope (V/s), tau seconds into a segment between two breakpoints, `length` (s) apart.
+
+    `terms` (k, 6) are c, n, a, omega, phi, beta of c tau^n exp(a tau) cos(phi + omega tau + beta tau^2 / 2), and
+    `series` (l,) are Chebyshev coefficients over the segment, or empty.
+    """
     u, du = 0.0, 0.0
-    for i in range(segment.terms.shape[0]):
-        if segment.terms[i, 0] != 0.0:
-            value, slope = term_at(segment.terms[i], tau)
+    for i in range(terms.shape[0]):
+        if terms[i, 0] != 0.0:
+            value, slope = term_at(terms[i], tau)
             u += value
             du += slope
-    if segment.series.size > 0:
-        value, slope = chebyshev.evaluate(segment.series, 2.0 * tau / segment.length - 1.0)
+    if series.size > 0:
+        value, slope = chebyshev.evaluate(series, 2.0 * tau / length - 1.0)
         u += value
-        du += slope * 2.0 / segment.length
+        du += slope * 2.0 / length
     return u, du
 
 
@@ -102,7 +95,7 @@ class Net(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """All sources on one window of time: their tables of `Segment`s, one after the other."""
+    """All sources on one window of time: tables of their segments (see `source`), one after the other."""
 
     # (n_s + 1,): First edge of each source; its first segment has that number less the number of sources before
     first: IntArray
@@ -155,8 +148,7 @@ def at_sources(sources: Sources, index: IntArray, base: float, t: float, s: Floa
         start = sources.edges[row]
         length = sources.edges[row + 1] - start
         # Each source has one edge more than it has segments.
-        segment = Segment(start, length, sources.terms[row - i], sources.series[row - i])
-        s[i], ds[i] = source(segment, (base - start) + t)
+        s[i], ds[i] = source(sources.terms[row - i], sources.series[row - i], length, (base - start) + t)
 
 
 @jit

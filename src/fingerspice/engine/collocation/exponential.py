@@ -12,10 +12,10 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray, aligned
 from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
-from fingerspice.engine.collocation.readout import N_PLACES, Modal, row_of
+from fingerspice.engine.collocation.readout import Modal, row_of
 from fingerspice.engine.many_areas.form import evaluate_many
 from fingerspice.engine.one_area.rows import evaluate_one, largest_size
-from fingerspice.numerics.lobatto import END, LOBES, MISS, NODES, ROWS, fill_table
+from fingerspice.numerics.lobatto import END, FIRST, LOBES, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 from fingerspice.numerics.modes import copy_to
 
 
@@ -228,11 +228,17 @@ def between(lobes: FloatArray, values: FloatArray) -> tuple[float, float, float]
 @jit_rows
 def left_over(phi: FloatArray, pull: FloatArray, used: FloatArray, at: FloatArray) -> None:
     """Response of a mode to the residual of the iteration, at the points between nodes and the end, into `at` (4,)."""
-    at[:] = 0.0
+    first, second, third, end = 0.0, 0.0, 0.0, 0.0
     for j in range(NODES):
         left = pull[j] - used[j]
-        for p in range(4):
-            at[p] += phi[j, row_of(p + 1)] * left
+        first += phi[j, FIRST] * left
+        second += phi[j, SECOND] * left
+        third += phi[j, THIRD] * left
+        end += phi[j, END] * left
+    at[0] = first
+    at[1] = second
+    at[2] = third
+    at[3] = end
 
 
 @jit
@@ -334,11 +340,18 @@ def node_error(node: FloatArray, node_s: FloatArray, places: FloatArray, off: Fl
     """
     m, worst = places.shape[0], 0.0
     for i in range(node.shape[0]):
-        for p in range(N_PLACES):
-            total = 0.0
-            for k in range(node.shape[1]):
-                total += node[i, k] * (places[k, p] + (off[4, k] if p == 0 else 0.0))
-            for e in range(node_s.shape[1] if 0 < p < N_PLACES - 1 else 0):
-                total += node_s[i, e] * off[p - 1, m + e]
-            worst = max(worst, abs(total))
+        start, first, second, third, end = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(node.shape[1]):
+            share = node[i, k]
+            start += share * (places[k, 0] + off[4, k])
+            first += share * places[k, 1]
+            second += share * places[k, 2]
+            third += share * places[k, 3]
+            end += share * places[k, 4]
+        for e in range(node_s.shape[1]):
+            share = node_s[i, e]
+            first += share * off[0, m + e]
+            second += share * off[1, m + e]
+            third += share * off[2, m + e]
+        worst = max(worst, abs(start), abs(first), abs(second), abs(third), abs(end))
     return worst

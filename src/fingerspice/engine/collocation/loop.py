@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import borrow, jit, jit_by_kind
+from fingerspice.base.compiled import borrow, jit, jit_by_kind, jit_within
 from fingerspice.engine.collocation import readout, step_control
 from fingerspice.engine.collocation.readout import LoopState
 from fingerspice.engine.collocation.step_control import NOT_FRESH, Pace, accept, allowed_factor, rung, shorten
@@ -228,7 +228,7 @@ def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
             step.length = step.wanted = shorten(h, factor, control)
 
 
-@jit
+@jit_within
 def _complete(circuit: Circuit, pace: Pace, state: LoopState) -> int:
     """End an accepted step at a zero or an edge, and move there."""
     step, control, sign, branch = state.step[0], state.control[0], state.sign, state.branch

@@ -386,7 +386,7 @@ STEP = np.dtype([
     ("t_new", float),  # s: reached at that fraction
     ("step_error", float),  # V: of the step, which controls its length
     ("grown", float),  # Largest ratio of a move of the gap voltage to the move of a state voltage
-    ("start", float),  # s: the last edge of a source, or 0 within a jump of a network's sources
+    ("start", float),  # s: last edge of a source, or where a network's call began; 0 within a jump of its sources
     ("edge", float),  # s: end of a stack's segment that starts there
     ("since", float),  # s: time since `start`
     ("reached", float),  # s: that at the end of the step

@@ -73,7 +73,7 @@ def source_rows(
     terms: FloatArray, series: FloatArray, length: float, t0: float, h: float, want_slope: bool, out: FloatArray,
     slope: FloatArray, scratch: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill source, and its slope if wanted, for a step of length h that starts t0 into a segment (see `Segment`)."""
+    """Fill source, and its slope if wanted, for a step of length h that starts t0 into a segment (see `source`)."""
     phase, rate = scratch[0], scratch[1]
     for i in range(ROWS):
         out[i] = 0.0

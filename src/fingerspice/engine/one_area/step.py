@@ -17,7 +17,7 @@ from fingerspice.engine.collocation import exponential, readout, step_control
 from fingerspice.engine.collocation.exponential import Tables, between, largest
 from fingerspice.engine.collocation.readout import N_PLACES, LoopState
 from fingerspice.engine.collocation.step_control import Pace
-from fingerspice.engine.network import Segment, Sources, on_branch, source
+from fingerspice.engine.network import Sources, on_branch, source
 from fingerspice.engine.one_area import rows
 from fingerspice.engine.one_area.charge import charge_step
 from fingerspice.engine.one_area.model import dot, turns_at_zero
@@ -100,8 +100,8 @@ def _enter_segment(c: OneArea, pace: Pace, s: LoopState) -> bool:
 @jit_within
 def source_voltage(c: OneArea, s: LoopState, tau: float) -> float:
     """Source voltage (V) `tau` s into the segment at hand."""
-    index, start = s.step[0].index, s.step[0].start
-    u, _ = source(Segment(start, s.step[0].edge - start, c.sources.terms[index], c.sources.series[index]), tau)
+    step = s.step[0]
+    u, _ = source(c.sources.terms[step.index], c.sources.series[step.index], step.edge - step.start, tau)
     return u
 
 
