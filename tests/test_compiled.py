@@ -221,8 +221,8 @@ def test_compiling_is_announced_by_one_line_and_repeated_only_after_a_change_of_
 # `source` calls `chebyshev.evaluate`, which stands in another file.
 ELSEWHERE = """
 import numpy as np
-from fingerspice.engine.network import Segment, source
-print(repr(source(Segment(0.0, 1.0, np.zeros((1, 6)), np.array([3.0, 0.0])), 0.5)[0]))
+from fingerspice.engine.network import source
+print(repr(source(np.zeros((1, 6)), np.array([3.0, 0.0]), 1.0, 0.5)[0]))
 """
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import fingerspice as fs
-from fingerspice.engine.network import Segment, source
+from fingerspice.engine.network import source
 from fingerspice.waveforms.sampling import SourceTable
 
 TAU = 2.0 * math.pi
@@ -39,8 +39,8 @@ def compiled(table: SourceTable, t: np.ndarray) -> np.ndarray:
     """Voltage and slope (n_t, 2) of a table by compiled code, right-hand at its edges."""
     index = np.clip(np.searchsorted(table.edges, t, side="right") - 1, 0, table.edges.size - 2)
     starts, spans = table.edges[index], np.diff(table.edges)[index]
-    segments = [Segment(*one) for one in zip(starts, spans, table.terms[index], table.series[index], strict=True)]
-    return np.array([source(segment, time - segment[0]) for segment, time in zip(segments, t, strict=True)])
+    parts = zip(table.terms[index], table.series[index], spans, t - starts, strict=True)
+    return np.array([source(*one) for one in parts])
 
 
 def turns(t: np.ndarray, f: float, delay: float = 0.0, phase_deg: float = 0.0) -> np.ndarray:

@@ -15,8 +15,9 @@ from fingerspice.base.arrays import ComplexArray, FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine import network
 from fingerspice.engine.collocation.readout import note
-from fingerspice.numerics.lobatto import Scheme
-from fingerspice.numerics.modes import copy_to, invert
+from fingerspice.engine.collocation.step_control import leaves
+from fingerspice.numerics.lobatto import NODES, POINTS, ROWS, Scheme
+from fingerspice.numerics.modes import copy_to, solve
 
 # Entry of `counters`: evaluations of the right-hand side.
 NFEV = 0
@@ -118,11 +119,13 @@ def linearise(c: Nodal) -> None:
 def _prepare_newton(scheme: Scheme, work: Work, h: float) -> bool:
     """Inverses of M - h lambda J for every eigenvalue of the scheme."""
     m = work.slope.shape[0]
+    matrix = np.zeros((m, m), np.complex128)
     for e in range(scheme.eigenvalues.size):
         for i in range(m):
             for j in range(m):
-                work.newton[e, i, j] = work.mass[i, j] - h * scheme.eigenvalues[e] * work.slope[i, j]
-        if not invert(work.newton[e]):
+                matrix[i, j] = work.mass[i, j] - h * scheme.eigenvalues[e] * work.slope[i, j]
+                work.newton[e, i, j] = 1.0 if i == j else 0.0
+        if solve(matrix, work.newton[e]) == 0.0:
             return False
     return True
 
@@ -292,14 +295,6 @@ ROUNDING = 1e-14
 
 
 @jit
-def _signed(c: Nodal, i: int, t: float, h: float, theta: float) -> float:
-    """Gap voltage i (V) at fraction `theta` of a step, times the sign of its branch: negative off the branch."""
-    _look(c, t, h, theta)
-    off: float = c.sign[i] * network.gap_voltage(c.net, c.room, i, c.work.stage)
-    return off
-
-
-@jit
 def _look(c: Nodal, t: float, h: float, theta: float) -> None:
     """State and sources at fraction `theta` of a step, into `work.stage` and `room`."""
     dense_state(theta, c.y, c.work.poly, c.work.stage)
@@ -310,30 +305,19 @@ def _look(c: Nodal, t: float, h: float, theta: float) -> None:
 def _first_zero(c: Nodal, t: float, h: float) -> tuple[float, int]:
     """First fraction of the step at which a gap voltage leaves its branch, and the index of its area; 2 and -1 if none.
 
-    Each gap voltage is sampled at the eighths of the step, and its sign change found by bisection.
+    It is a zero of the polynomial through the gap voltage at the nodes of an exponential step.
     """
+    u, series = np.zeros((c.sign.size, NODES)), np.zeros(ROWS)
+    for j in range(NODES):
+        _look(c, t, h, POINTS[j])
+        for i in range(c.sign.size):
+            if c.net.gap[i] >= 0:
+                u[i, j] = network.gap_voltage(c.net, c.room, i, c.work.stage)
     first, which = 2.0, -1
     for i in range(c.sign.size):
-        if c.net.gap[i] < 0:
-            continue
-        lo, f_lo = 0.0, _signed(c, i, t, h, 0.0)
-        hi, f_hi = 0.0, 0.0
-        for part in range(1, 9):
-            hi = 0.125 * part
-            f_hi = _signed(c, i, t, h, hi)
-            if f_hi < 0.0:
-                break
-            lo, f_lo = hi, f_hi
-        if not f_hi < 0.0 or lo >= first:
-            continue
-        while f_lo > 0.0 and hi - lo > 4e-16:
-            middle = 0.5 * (lo + hi)
-            if _signed(c, i, t, h, middle) < 0.0:
-                hi = middle
-            else:
-                lo = middle
-        if hi < first:
-            first, which = hi if f_lo > 0.0 else lo, i
+        found = leaves(u[i], c.sign[i], 0.0, series)
+        if found < first:
+            first, which = found, i
     return first, which
 
 

@@ -22,24 +22,13 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.numerics import chebyshev
-from fingerspice.numerics.modes import copy_to
+from fingerspice.numerics.modes import copy_to, solve
 from fingerspice.physics.contact import inverse_area
-
-
-class Segment(NamedTuple):
-    """The source between two breakpoints."""
-
-    # start, length: Seconds
-    start: float
-    length: float
-    # (k, 6): c, n, a, omega, phi, beta of c tau^n exp(a tau) cos(phi + omega tau + beta tau^2 / 2), tau from the start
-    terms: FloatArray
-    series: FloatArray  # (l,): Chebyshev coefficients over the segment, or empty
 
 
 @jit
 def term_at(term: FloatArray, tau: float) -> tuple[float, float]:
-    """Value and slope of one term of a `Segment`, tau seconds into it."""
+    """Value and slope of one term of a segment, tau seconds into it; see `source`."""
     value, slope, n, a = term[0], 0.0, term[1], term[2]
     if n == 1.0:
         slope = value
@@ -61,18 +50,22 @@ def term_at(term: FloatArray, tau: float) -> tuple[float, float]:
 
 
 @jit
-def source(segment: Segment, tau: float) -> tuple[float, float]:
-    """Source voltage (V) and its slope (V/s), tau seconds into a segment."""
+def source(terms: FloatArray, series: FloatArray, length: float, tau: float) -> tuple[float, float]:
+    """Source voltage (V) and its slope (V/s), tau seconds into a segment between two breakpoints, `length` (s) apart.
+
+    `terms` (k, 6) are c, n, a, omega, phi, beta of c tau^n exp(a tau) cos(phi + omega tau + beta tau^2 / 2), and
+    `series` (l,) are Chebyshev coefficients over the segment, or empty.
+    """
     u, du = 0.0, 0.0
-    for i in range(segment.terms.shape[0]):
-        if segment.terms[i, 0] != 0.0:
-            value, slope = term_at(segment.terms[i], tau)
+    for i in range(terms.shape[0]):
+        if terms[i, 0] != 0.0:
+            value, slope = term_at(terms[i], tau)
             u += value
             du += slope
-    if segment.series.size > 0:
-        value, slope = chebyshev.evaluate(segment.series, 2.0 * tau / segment.length - 1.0)
+    if series.size > 0:
+        value, slope = chebyshev.evaluate(series, 2.0 * tau / length - 1.0)
         u += value
-        du += slope * 2.0 / segment.length
+        du += slope * 2.0 / length
     return u, du
 
 
@@ -102,7 +95,7 @@ class Net(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """All sources on one window of time: their tables of `Segment`s, one after the other."""
+    """All sources on one window of time: tables of their segments (see `source`), one after the other."""
 
     # (n_s + 1,): First edge of each source; its first segment has that number less the number of sources before
     first: IntArray
@@ -155,8 +148,7 @@ def at_sources(sources: Sources, index: IntArray, base: float, t: float, s: Floa
         start = sources.edges[row]
         length = sources.edges[row + 1] - start
         # Each source has one edge more than it has segments.
-        segment = Segment(start, length, sources.terms[row - i], sources.series[row - i])
-        s[i], ds[i] = source(segment, (base - start) + t)
+        s[i], ds[i] = source(sources.terms[row - i], sources.series[row - i], length, (base - start) + t)
 
 
 @jit
@@ -181,38 +173,6 @@ def on_branch(mobile: bool, curve: FloatArray, sign: float, u: float) -> tuple[f
         sign = -sign
     q, dq = inverse_area(sign * u, curve)
     return q, sign * dq
-
-
-@jit
-def solve_in_place(matrix: FloatArray, x: FloatArray) -> bool:
-    """matrix^-1 x into x by elimination with row pivoting; False where the determinant is not positive."""
-    n = x.size
-    positive = True
-    for column in range(n):
-        pivot = column
-        for row in range(column + 1, n):
-            if abs(matrix[row, column]) > abs(matrix[pivot, column]):
-                pivot = row
-        if pivot != column:
-            positive = not positive
-            x[column], x[pivot] = x[pivot], x[column]
-            for j in range(column, n):
-                matrix[column, j], matrix[pivot, j] = matrix[pivot, j], matrix[column, j]
-        if not abs(matrix[column, column]) > 0.0:
-            return False
-        if matrix[column, column] < 0.0:
-            positive = not positive
-        for row in range(column + 1, n):
-            factor = matrix[row, column] / matrix[column, column]
-            if factor != 0.0:
-                for j in range(column + 1, n):
-                    matrix[row, j] -= factor * matrix[column, j]
-                x[row] -= factor * x[column]
-    for row in range(n - 1, -1, -1):
-        for j in range(row + 1, n):
-            x[row] -= matrix[row, j] * x[j]
-        x[row] /= matrix[row, row]
-    return positive
 
 
 @jit
@@ -326,7 +286,7 @@ def rates(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, out
     capacitances(net, room, y, sign)
     room.k[:] = 0.0
     residual(net, room, jump, y, sign, room.k, out)
-    if not solve_in_place(room.matrix, out[:n]):
+    if not solve(room.matrix, out[:n].reshape(n, 1)) > 0.0:
         return False
     # The charges' rates need the voltages' own.
     residual(net, room, jump, y, sign, out, room.probe)

@@ -44,38 +44,41 @@ def apply(matrix: FloatArray, x: FloatArray, out: FloatArray) -> None:
 
 
 @jit
-def invert(matrix: FloatArray | ComplexArray) -> bool:
-    """Invert a matrix (n, n) in place by Gauss-Jordan elimination with row pivoting; False where it is singular."""
-    n = matrix.shape[0]
-    order = np.arange(n)
+def solve(matrix: FloatArray | ComplexArray, x: FloatArray | ComplexArray) -> float:
+    """matrix^-1 x into x (n, m) by elimination with row pivoting; `matrix` (n, n) is used up.
+
+    Returns the sign of the determinant of a real matrix; 0 where one, real or complex, is singular.
+    """
+    n, sign = matrix.shape[0], 1.0
     for column in range(n):
         pivot = column
         for row in range(column + 1, n):
             if abs(matrix[row, column]) > abs(matrix[pivot, column]):
                 pivot = row
-        size = abs(matrix[pivot, column])
-        if not 0.0 < size < np.inf:
-            return False
-        order[column], order[pivot] = order[pivot], order[column]
-        for j in range(n):
-            matrix[column, j], matrix[pivot, j] = matrix[pivot, j], matrix[column, j]
-        scale = 1.0 / matrix[column, column]
-        matrix[column, column] = 1.0
-        for j in range(n):
-            matrix[column, j] *= scale
-        for row in range(n):
-            factor = matrix[row, column]
-            if row != column and factor != 0.0:
-                matrix[row, column] = 0.0
-                for j in range(n):
+        if pivot != column:
+            sign = -sign
+            for k in range(x.shape[1]):
+                x[column, k], x[pivot, k] = x[pivot, k], x[column, k]
+            for j in range(column, n):
+                matrix[column, j], matrix[pivot, j] = matrix[pivot, j], matrix[column, j]
+        if not 0.0 < abs(matrix[column, column]) < np.inf:
+            return 0.0
+        if matrix[column, column].real < 0.0:
+            sign = -sign
+        for row in range(column + 1, n):
+            factor = matrix[row, column] / matrix[column, column]
+            if factor != 0.0:
+                for j in range(column + 1, n):
                     matrix[row, j] -= factor * matrix[column, j]
-    swapped = np.empty(n, matrix.dtype)
-    for row in range(n):
-        for j in range(n):
-            swapped[order[j]] = matrix[row, j]
-        for j in range(n):
-            matrix[row, j] = swapped[j]
-    return True
+                for k in range(x.shape[1]):
+                    x[row, k] -= factor * x[column, k]
+    for row in range(n - 1, -1, -1):
+        for j in range(row + 1, n):
+            for k in range(x.shape[1]):
+                x[row, k] -= matrix[row, j] * x[j, k]
+        for k in range(x.shape[1]):
+            x[row, k] /= matrix[row, row]
+    return sign
 
 
 @jit

@@ -111,8 +111,10 @@ class Track(Stepping):
         super().begin(initial, tol)
         began = self.problem.inner if initial is self.problem.initial else to_loop(self.problem.scene, initial)
         (self.y[:], u_gap), self.control["u_before"] = began, initial.s_before[0]
-        if self.system.model.mobile and self.sign[0] != 0.0:
-            self.control["u_gap"], self.control["sign"] = u_gap, math.copysign(1.0, u_gap)
+        # The sign along the loop, where a run under `mobile` goes on from a branch.
+        self.sign[0] *= float(self.system.model.mobile)
+        if self.sign[0] != 0.0:
+            self.control["u_gap"], self.sign[0] = u_gap, math.copysign(1.0, u_gap)
 
     @property
     def rounding(self) -> list[float]:
@@ -134,11 +136,13 @@ class Track(Stepping):
     def state(self) -> State:
         model, before, u_gap = self.system.model, float(self.control["u_before"]), float(self.control["u_gap"])
         if model.mobile:
-            u_gap = gap_at(model, self.y, before, float(self.control["sign"]) or 1.0, u_gap)
+            u_gap = gap_at(model, self.y, before, float(self.sign[0]) or 1.0, u_gap)
         return from_loop(self.problem.scene, self.t, self.y, before, u_gap)
 
     def jump(self, after: FloatArray) -> bool:
-        met = enter(self.system.model, self.pace.charge, float(after[0]), self.y, self.control)
+        met = enter(
+            self.system.model, self.pace.charge, float(after[0]), self.y, self.control, self.sign, self.branch
+        )  # fmt: skip
         self.control["u_before"] = after[0]
         return bool(met)
 
@@ -303,7 +307,6 @@ class March(Stepping):
     def begin(self, initial: State, tol: float) -> None:
         super().begin(initial, tol)
         self.control["magnified"] = 1.0
-        self.branch = np.tile([self.problem.t_start, math.inf], (self.net.gap.size, 1))
 
     @property
     def rounding(self) -> list[float]:
@@ -320,7 +323,7 @@ class March(Stepping):
         known = self.references
         return ManyAreas(
             self.form, self.held, known.arrays, known.tables, self.work, integral_table(), sources, self.u_scale,
-            self.sign, self.s_before, self.branch,
+            self.s_before,
         )  # fmt: skip
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:

@@ -56,7 +56,6 @@ class Stepping(Integration):
     capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
     charge_safety = 1.0  # Stated error of the charge over the estimate
     rates: FloatArray  # Decay rates of the modes, among them those at 0 V, 1/s
-    branch = np.zeros((0, 2))  # (n_area, 2): As in `ManyAreas`; none for a stack
     looks = loop.no_looks()  # Those of a run that `look` does not prepare
 
     def __init__(self, problem: Problem, tol: float, shown: int, width: int) -> None:
@@ -97,7 +96,8 @@ class Stepping(Integration):
         """Go to the start, with an initial state and an error of a step (V)."""
         self.controls, self.step = np.zeros(1, readout.CONTROL), np.zeros(1, readout.STEP)
         self.control = self.controls[0]
-        self.control["t"], self.control["branch_length"], self.control["margin"] = self.problem.t_start, math.inf, 1.0
+        self.control["t"], self.control["margin"] = self.problem.t_start, 1.0
+        self.branch = np.full((self.net.gap.size, 2), [self.problem.t_start, math.inf])  # As in `LoopState`
         self.counters, self.error = np.zeros(readout.N_COUNTERS, np.int64), np.zeros(self.n_error)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
         self.y[:], self.s_before[:], self.sign[:] = initial.y, initial.s_before, initial.sign
@@ -130,8 +130,8 @@ class Stepping(Integration):
         """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `readout`."""
         while True:
             state = LoopState(
-                self.y, self.error, self.controls, self.counters, self.step, self.peaks, self.collected, self.outputs,
-                self.kept, self.recorder.room, self.tried,
+                self.y, self.error, self.sign, self.branch, self.controls, self.counters, self.step, self.peaks,
+                self.collected, self.outputs, self.kept, self.recorder.room, self.tried,
             )  # fmt: skip
             code = int(loop.march_on(self.circuit(sources), self.pace, state, looks, t_end))
             if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
@@ -239,7 +239,6 @@ class Stepping(Integration):
         reached = self.t + periods * period
         self.control["t"] = stop if abs(stop - reached) <= same_time(stop) else reached
         self.branch[:, 0] += periods * period
-        self.control["branch_start"] += periods * period
         # What the voltages, and the charge over the capacitance, are still off the periodic state: `off` and `owed`, V.
         for peak in self.peaks:
             peak[readout.ERROR_U] += off

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import borrow, jit, jit_by_kind
-from fingerspice.engine.collocation import readout
+from fingerspice.base.compiled import borrow, jit, jit_by_kind, jit_within
+from fingerspice.engine.collocation import readout, step_control
 from fingerspice.engine.collocation.readout import LoopState
 from fingerspice.engine.collocation.step_control import NOT_FRESH, Pace, accept, allowed_factor, rung, shorten
 from fingerspice.engine.many_areas import step as network
@@ -119,11 +119,12 @@ def look(looks: Looks, s: LoopState) -> bool:
 Circuit = OneArea | ManyAreas
 # The parts of a step, which both kinds of circuits have: begin a call of the loop; find where the next step starts, and
 # the length to try first; solve a step of that length, and estimate its error; tell why no shorter step would do after
-# one that was rejected (GO_ON if one may); the fraction of it at which the next one should end, if it went far beyond a
-# zero, or 2; end an accepted step, write its outputs, account for its errors, and move to its end; end a call.
-_start, _begin, _attempt, _refuse, _beyond, _complete, _end = (
+# one that was rejected (GO_ON if one may), and whether it went far beyond a zero; the fraction of an accepted one at
+# which the gap voltage of an area leaves its branch, or 2; write its outputs, account for its errors, and take the
+# state at its end; end a call.
+_start, _begin, _attempt, _refuse, _crossing, _finish, _end = (
     jit_by_kind(OneArea=getattr(stack, part), ManyAreas=getattr(network, part))
-    for part in ("start", "begin", "attempt", "refuse", "beyond", "complete", "end")
+    for part in ("start", "begin", "attempt", "refuse", "crossing", "finish", "end")
 )
 
 
@@ -218,11 +219,51 @@ def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
             return readout.GO_ON
         step.tries += 1
         counters[readout.REJECTED] += 1
-        code = _refuse(circuit, state)
+        code = _refuse(circuit, pace, state)
         if code != readout.GO_ON:
             return code
-        reach = _beyond(circuit, pace, state)
-        if reach < 2.0:
-            step.length = rung(h * min(0.9, reach))
+        if step.too_far < 2.0:
+            step.length = rung(h * min(0.9, step.too_far))
         else:
             step.length = step.wanted = shorten(h, factor, control)
+
+
+@jit_within
+def _complete(circuit: Circuit, pace: Pace, state: LoopState) -> int:
+    """End an accepted step at a zero or an edge, and move there."""
+    step, control, sign, branch = state.step[0], state.control[0], state.sign, state.branch
+    h, length, turned_enough = step.length, step.stop - step.start, step.flips > sign.size
+    step.theta, step.reached, step.crossed = 1.0, step.since + h, -1
+    if step.reached >= length or length - step.reached <= 1e-12 * h:
+        step.theta, step.reached = min(1.0, (length - step.since) / h), length
+    off = 0.0
+    for a in range(sign.size):
+        fraction = _crossing(circuit, pace, state, a)
+        reached = step.since + fraction * h
+        # Zeros at the start of the step are passed over after some turns.
+        if fraction <= step.theta and reached <= step.reached and not (turned_enough and reached <= step.since):
+            step.theta, step.reached, step.crossed = fraction, reached, a
+    a = step.crossed
+    if a >= 0 and step.reached <= step.since:
+        return int(step_control.turn(state, a))
+    for b in range(sign.size if turned_enough else 0):
+        off = max(off, step_control.farthest_off(circuit.work.modal.u[b], sign[b], step.theta))
+    if off > pace.tol and readout.may_shorten(state):
+        return readout.AGAIN
+    step.flips, step.t_new = 0, step.stop if step.reached == length else step.start + step.reached
+    code: int = _finish(circuit, pace.charge, state)
+    if code != readout.GO_ON:
+        return code
+    if a >= 0:
+        sign[a], branch[a, 0], branch[a, 1] = -sign[a], step.t_new, step.t_new - branch[a, 0]
+        state.counters[readout.ZEROS] += 1
+        # The area has a kink here, which excites fast modes again: the first step is chosen as after other zeros.
+        if step.below > 0.0:
+            # The gap voltage returns to 0 V soon.
+            control.h, control.allowed = 2.0 * (step.below - step.theta) * h, 0.0
+        elif control.h_after_zero > 0.0:
+            control.h, control.allowed = control.h_after_zero, 0.0
+        step.fresh = step_control.AFTER_ZERO
+    control.t, step.since = step.t_new, step.reached
+    state.counters[readout.ACCEPTED] += 1
+    return readout.GO_ON

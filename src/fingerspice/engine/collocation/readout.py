@@ -16,17 +16,14 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, IntArray, aligned
 from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
 from fingerspice.numerics.chebyshev import to_powers
-from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES, multiply
+from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES
 from fingerspice.numerics.modes import copy_to
 
 CONTROL = np.dtype([
     ("t", float),  # s
     ("h", float),  # s: length of the next step
-    ("sign", float),  # Of the gap voltage, on the branch of the area
     ("u_before", float),  # V: source before `t`
     ("u_gap", float),  # V
-    ("branch_start", float),  # s
-    ("branch_length", float),  # s: of the branch before; infinite before the first
     ("too_long", float),  # s: a length that was rejected recently
     ("h_after_edge", float),  # s: the first step taken after an edge of the source
     ("magnified", float),  # Largest change of the gap voltage for a change of 1 V of a state voltage
@@ -193,22 +190,6 @@ def end_at(theta: float, x: Modal, error: FloatArray) -> None:
     for k in range(w0.size):
         w0[k] = at(w[k], basis)
         error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
-
-
-@jit_rows
-def layers(
-    mobile: bool, area0: float, k_shown: FloatArray, shown: FloatArray, w: FloatArray, source: FloatArray,
-    q: FloatArray, values: FloatArray,
-) -> None:  # fmt: skip
-    """Recorded voltages at all rows."""
-    multiply(shown, w, None, values)
-    for i in range(shown.shape[0]):
-        if mobile:
-            for j in range(ROWS):
-                values[i, j] *= area0 * q[j]
-        share = k_shown[i]
-        for j in range(ROWS):
-            values[i, j] += share * source[j]
 
 
 @jit_rows
@@ -405,12 +386,14 @@ STEP = np.dtype([
     ("t_new", float),  # s: reached at that fraction
     ("step_error", float),  # V: of the step, which controls its length
     ("grown", float),  # Largest ratio of a move of the gap voltage to the move of a state voltage
-    ("start", float),  # s: of the source's segment at hand
-    ("edge", float),  # s: its end
-    ("since", float),  # s: time since its start
+    ("start", float),  # s: last edge of a source, or where a network's call began; 0 within a jump of its sources
+    ("edge", float),  # s: end of a stack's segment that starts there
+    ("since", float),  # s: time since `start`
+    ("reached", float),  # s: that at the end of the step
     ("stop", float),  # s: end of the step's range
     ("begun", float),  # s: since which evaluations are counted
     ("below", float),  # Fraction of the step at which the gap voltage dips off its branch, or 0
+    ("too_far", float),  # Fraction of a rejected step at which the next one should end; see `refuse`
     ("is_paused", np.int64),
     ("index", np.int64),  # Of the source's segment
     ("level", np.int64),  # Of the reference area
@@ -443,6 +426,10 @@ class LoopState(NamedTuple):
     y: FloatArray  # State voltages (V), areas with a time constant, and charges (C)
     # Estimated error of the modes, signed; of a stack, then the number of the reference area that they belong to
     error: FloatArray
+    # sign, branch (n_area,) and (n_area, 2): Of each area the sign of the gap voltage on its branch (0: to be chosen);
+    # the time at which the branch began, and the length of the branch before, infinite before the first, s
+    sign: FloatArray
+    branch: FloatArray
     # control, counters: Bookkeeping, see `engine.collocation.readout`
     control: Control
     counters: IntArray
@@ -461,12 +448,9 @@ class LoopState(NamedTuple):
 
 
 @jit_within
-def may_shorten(s: LoopState, since: float) -> bool:
-    """Let a quarter be tried of a step that starts at a zero and is on neither branch; False where it is rounding.
-
-    The rounding of its length is relative to the time `since` (s).
-    """
-    if s.step[0].length <= 1e-13 * max(since, 1e-3 * (s.step[0].stop - s.control[0].t)):
+def may_shorten(s: LoopState) -> bool:
+    """Let a quarter be tried of a step that starts at a zero and is on neither branch; False where it is rounding."""
+    if s.step[0].length <= 1e-13 * max(s.step[0].since, 1e-3 * (s.step[0].stop - s.control[0].t)):
         return False
     s.counters[REJECTED] += 1
     s.control[0].h, s.step[0].flips = 0.25 * s.step[0].length, 0

@@ -6,13 +6,13 @@ At a zero of the gap voltage a branch of the area ends: zeros are found from the
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.collocation.readout import Control, series_of
+from fingerspice.engine.collocation.readout import AGAIN, Control, series_of
 from fingerspice.engine.one_area.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp
 from fingerspice.numerics.chebyshev import evaluate, summit
 from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS
@@ -56,7 +56,9 @@ def nearest_level(q0: FloatArray, q: float) -> int:
 
 
 @jit
-def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: Control) -> bool:
+def enter(
+    model: Model, charge: bool, u_source: float, y: FloatArray, control: Control, sign: FloatArray, branch: FloatArray
+) -> bool:  # fmt: skip
     """Take a jump of the source at this time, if there is one, and the branch after it; False if it meets a fold."""
     x_gap = dot(model.gap, y)
     if not model.mobile and u_source != control.u_before and charge:
@@ -64,43 +66,49 @@ def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: C
         y[-1] += moved
         control.error_q += error
     k_u = model.k_gap * u_source
-    if model.mobile and control.sign != 0.0:
+    if model.mobile and sign[0] != 0.0:
         u = ramp(model, k_u, x_gap, control.u_gap)
-        sign = control.sign if u == 0.0 else math.copysign(1.0, u)
+        side = sign[0] if u == 0.0 else math.copysign(1.0, u)
     else:
-        sign = choose_branch(model, u_source, y)
-        u = gap_voltage(model, k_u, x_gap, sign, k_u)
+        side = choose_branch(model, u_source, y)
+        u = gap_voltage(model, k_u, x_gap, side, k_u)
     if u != u:
         return False
-    take_branch(sign if model.coupled else 1.0, control)
+    side = side if model.coupled else 1.0
+    if side != sign[0]:
+        # The length of a new branch is not known yet.
+        sign[0], branch[0, 0], branch[0, 1] = side, control.t, math.inf
     control.u_gap = u
     return True
 
 
 @jit
-def take_branch(sign: float, control: Control) -> None:
-    """Take the branch of a sign; a new branch starts here, and its length is not known yet."""
-    if sign != control.sign:
-        control.branch_start = control.t
-        control.branch_length = math.inf
-    control.sign = sign
+def turn(s: Any, a: int) -> int:
+    """Change the branch of area a at the start of a step, and start again with this step."""
+    s.sign[a], s.branch[a, 0], s.branch[a, 1] = -s.sign[a], s.control[0].t, math.inf
+    s.step[0].flips += 1
+    return AGAIN
 
 
 @jit
 def choose_step(
-    pace: Pace, tau: float, coupled: bool, is_series: bool, t: float, remaining: float, control: Control
-) -> float:
-    """Length of the next step, s: one of the ladder, or exactly to the end of a segment that cannot be continued."""
+    pace: Pace, tau: float, is_series: bool, branch: FloatArray, remaining: float, control: Control
+) -> float:  # fmt: skip
+    """Length of the next step, s: one of the ladder, or exactly to the end of a segment that cannot be continued.
+
+    It aims at the end of the segment or of a branch, if that is as long as the one before it.
+    """
     if not pace.controlled:
         return pace.h_max
     h = control.h
     if h == 0.0:
         h = 4.0 * tau
     h = min(h, pace.h_max)
-    ahead = control.branch_start + BEYOND * control.branch_length - t
     target = remaining
-    if coupled and 0.0 < ahead < remaining:
-        target = ahead
+    for a in range(branch.shape[0]):
+        ahead = branch[a, 0] + BEYOND * branch[a, 1] - control.t
+        if 0.0 < ahead < target:
+            target = ahead
     # `math.ceil` is an integer in compiled code: it would overflow from 1e19 steps on.
     h = target / np.ceil(target / h) if h < target else target
     if is_series:

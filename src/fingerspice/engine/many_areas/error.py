@@ -214,7 +214,7 @@ def charge_error(
     _cell_errors(form, brief, areas[forms.SLOPE], cell_slips[1])
     off_briefly, mobile = np.empty(N_PLACES), form.mobile
     for source in range(form.stored.shape[0]):
-        first, second, third = between(lobes, z[source])
+        between_nodes = between(lobes, z[source])
         swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
         if not mobile:
             swing, end = _area_missed(form, source, work, lobes)
@@ -223,7 +223,7 @@ def charge_error(
             lobe = max(lobe, _HALF_LOBE * h * abs(leak))
         for p in range(N_PLACES):
             held = _part(form, source, p, form.stored, form.c, mobile, brief, cell_slips[1], u, more)
-            own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
+            own = between_nodes[p - 1] if 0 < p < N_PLACES - 1 else 0.0
             off_briefly[p] = max(abs(held), abs(own), swing, lobe)
             apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
         # After a step that is cut short its lobes last, and the difference between its charge and its modes. The signs

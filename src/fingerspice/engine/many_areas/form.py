@@ -109,7 +109,7 @@ class Jump(NamedTuple):
     # control (2,), sign: Bookkeeping before the jump and at its start, and branches of the areas before it
     control: NDArray[Any]
     sign: FloatArray
-    branch: FloatArray  # (n_area, 2): `ManyAreas.branch` before it; within a jump it goes by the fraction of the jump
+    branch: FloatArray  # (n_area, 2): `LoopState.branch` before it; within a jump it goes by the fraction of the jump
 
 
 class Work(NamedTuple):
@@ -183,13 +183,6 @@ def mode_rates(
 
 
 @jit_rows
-def clear(rows: FloatArray) -> None:
-    for c in range(rows.shape[0]):
-        for i in range(ROWS):
-            rows[c, i] = 0.0
-
-
-@jit_rows
 def _inverted(q: FloatArray, dq: FloatArray, slopes_too: bool) -> None:
     """The area and, if wanted, its slope in place of 1/A and the slope of that."""
     for i in range(ROWS):
@@ -236,7 +229,7 @@ def evaluate_many(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool
     With `probing`, the modes are not those of the step at hand, and other rows are taken, so that those of the step
     stay as they are. False beyond a fold.
     """
-    form, work, sign, h, several = form_of(c, s), c.work, c.sign, s.step[0].length, s.step[0].several > 0
+    form, work, sign, h, several = form_of(c, s), c.work, s.sign, s.step[0].length, s.step[0].several > 0
     # Derivatives of stiff modes, blocks of rows, and the distance to the fold.
     d, cells, areas, least = work.d, work.cells, work.areas, work.room[3]
     if probing:
@@ -250,7 +243,7 @@ def evaluate_many(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool
     eta, rho = cells[ETA], cells[RHO]
     area, slope, rate, more = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE]
     multiply(form.gap, w, areas[U_S], areas[U])
-    clear(pull)
+    pull[:] = 0.0
     if stiff:
         mode_rates(h, rates, w, lin, pull, True, d)
     for a in range(form.cell.size):

@@ -89,10 +89,7 @@ class ManyAreas(NamedTuple):
     integral: FloatArray  # `lobatto.integral_table()`
     sources: Sources
     u_scale: float  # Largest voltage, V; the error of an area with a time constant is measured as a fraction of it
-    # sign, s_before: Branch of each area (0: to be chosen), and the sources' values just before the time reached
-    sign: FloatArray
-    s_before: FloatArray
-    branch: FloatArray  # (n_area, 2): Time at which each area's branch began, and length of the branch before, s
+    s_before: FloatArray  # (n_s,): The sources' values just before the time reached
 
 
 @jit
@@ -100,7 +97,7 @@ def start(c: ManyAreas, s: LoopState) -> None:
     """Begin a window of the sources."""
     form, work, step, counters = c.form, c.work, s.step[0], s.counters
     n = form.shape.shape[0]
-    step.fresh = step_control.NOT_FRESH
+    step.fresh, step.start, step.since = step_control.NOT_FRESH, s.control[0].t, 0.0
     step.in_jump, step.has_begun, step.unconverged = 0, 0, 0
     step.accepted_before = counters[readout.ACCEPTED]
     step.several = 0
@@ -131,6 +128,7 @@ def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
             return readout.DONE
     t = control.t
     if step.at_edge > 0:
+        step.start, step.since = t, 0.0
         # Step lengths after a jump are often those after the previous jump.
         control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
         step.fresh = step_control.AFTER_EDGE
@@ -142,7 +140,8 @@ def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
     longest = Pace(pace.tol, 1.0, True, pace.charge) if step.in_jump > 0 else pace
     is_series = c.sources.series.shape[1] > 0 and step.in_jump == 0
     # If all rates are zero, the time constant is infinite.
-    step.length = step_control.choose_step(longest, 1.0 / rates.max(), True, is_series, t, step.stop - t, control)
+    remaining = step.stop - step.start - step.since
+    step.length = step_control.choose_step(longest, 1.0 / rates.max(), is_series, s.branch, remaining, control)
     return readout.GO_ON
 
 
@@ -173,14 +172,14 @@ def _enter_jump(c: ManyAreas, s: LoopState) -> None:
     jump, step, control = c.work.jump, s.step[0], s.control[0]
     step.in_jump, step.at_edge = 1, 0
     jump.control[0] = s.control[0]
-    copy_to(jump.sign, c.sign)
+    copy_to(jump.sign, s.sign)
     copy_to(jump.before, c.s_before)
     copy_to(jump.after, c.work.now)
-    copy_to(jump.branch, c.branch)
-    c.branch[:] = 0.0
+    copy_to(jump.branch, s.branch)
+    s.branch[:] = 0.0
     s.control[0] = jump.control[1]
     control.error_q, control.magnified = jump.control[0].error_q, jump.control[0].magnified
-    s.step[0].tabled, s.step[0].stop = 0.0, 1.0
+    step.tabled, step.start, step.since, step.stop = 0.0, 0.0, 0.0, 1.0
     copy_to(c.work.now, jump.before)
 
 
@@ -190,10 +189,10 @@ def _leave_jump(c: ManyAreas, s: LoopState) -> None:
     jump = c.work.jump
     resume_time(c, s)
     copy_to(c.s_before, jump.after)
-    for a in range(c.sign.size):
-        if c.sign[a] != jump.sign[a]:
-            c.branch[a, 0], c.branch[a, 1] = s.control[0].t, math.inf
-    s.step[0].tabled = 0.0
+    for a in range(s.sign.size):
+        if s.sign[a] != jump.sign[a]:
+            s.branch[a, 0], s.branch[a, 1] = s.control[0].t, math.inf
+    s.step[0].tabled, s.step[0].start, s.step[0].since = 0.0, s.control[0].t, 0.0
 
 
 @jit
@@ -202,17 +201,15 @@ def resume_time(c: ManyAreas, s: LoopState) -> None:
     jump, control = c.work.jump, s.control[0]
     jump.control[0].error_q, jump.control[0].magnified = control.error_q, control.magnified
     s.control[0] = jump.control[0]
-    copy_to(c.branch, jump.branch)
+    copy_to(s.branch, jump.branch)
     s.step[0].in_jump = 0
 
 
 @jit
 def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
-    """The areas at the start of a step and, where it is not known yet, the branch of each; the next zero to expect."""
-    form, work, control, sign = c.form, c.work, s.control[0], c.sign
-    branch, in_jump, w0, now = c.branch, s.step[0].in_jump > 0, work.modal.w0, work.now
-    ahead = math.inf
-    control.branch_start, control.branch_length = t, math.inf
+    """The areas at the start of a step and, where it is not known yet, the branch of each."""
+    form, work, sign, branch = c.form, c.work, s.sign, s.branch
+    in_jump, w0, now = s.step[0].in_jump > 0, work.modal.w0, work.now
     for a in range(sign.size):
         if form.cell[a] < 0:
             sign[a] = 1.0
@@ -226,10 +223,6 @@ def _choose_branches(c: ManyAreas, s: LoopState, t: float) -> None:
             work.here[a] = (
                 form.unit[a] * s.y[slow] if slow >= 0 else 1.0 / inverse_area(abs(voltage), form.curves[a])[0]
             )
-        end = branch[a, 0] + step_control.BEYOND * branch[a, 1] - t
-        if 0.0 < end < ahead:
-            ahead = end
-            control.branch_start, control.branch_length = branch[a, 0], branch[a, 1]
 
 
 @jit
@@ -267,7 +260,7 @@ def _take_coupling(c: ManyAreas, s: LoopState, h: float) -> None:
 def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
     form, work, x, step, tol = forms.form_of(c, s), c.work, c.work.modal, s.step[0], pace.tol
-    branch, t, in_jump, h, u = c.branch, s.control[0].t, s.step[0].in_jump > 0, s.step[0].length, x.u
+    branch, t, in_jump, h, u = s.branch, s.control[0].t, s.step[0].in_jump > 0, s.step[0].length, x.u
     if h != step.tabled:
         exponential.take_tables(c, s, -1 if in_jump else work.at[0], h, form.rates, work.size)
         _take_coupling(c, s, h)
@@ -278,8 +271,8 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
         slopes = pace.charge or step.smooth == 0
         forms.source_rows(c.sources, work.segment, t, h, slopes, work.room, work.s, work.ds)
     forms.follow_sources(form, work)
-    forms.clear(x.guess)
-    forms.clear(work.cells[forms.RHO])
+    x.guess[:] = 0.0
+    work.cells[forms.RHO] = 0.0
     exponential.free(c.tables.decay[step.slot], x.w0, x.w)
     exponential.respond(work.lin, c.tables.phi[step.slot], x.w, x.base)
     passes, closed, answer = exponential.converge(c, s, 0.3 * tol)
@@ -288,7 +281,7 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     # An iteration that has not converged says nothing about the sign of the gap voltage.
     if not closed:
         return readout.GO_ON
-    if step.flips <= c.sign.size and errors.turn_at_start(form.cell, u, c.sign, tol, t, branch):
+    if step.flips <= s.sign.size and errors.turn_at_start(form.cell, u, s.sign, tol, t, branch):
         step.flips += 1
         return readout.RETRY
     if form.mobile:
@@ -300,9 +293,19 @@ def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
 
 
 @jit
-def refuse(c: ManyAreas, s: LoopState) -> int:
-    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
-    step, t = s.step[0], s.control[0].t
+def refuse(c: ManyAreas, pace: Pace, s: LoopState) -> int:
+    """Why no shorter step would do after one that was rejected; GO_ON if one may.
+
+    `too_far` is set to the fraction of it at which the next one should end, soon after a zero far beyond which it went,
+    as there the branch of an area has no meaning, and the error says nothing; or to 2.
+    """
+    form, u, step, t = c.form, c.work.modal.u, s.step[0], s.control[0].t
+    step.too_far = 2.0
+    for a in range(s.sign.size):
+        if form.cell[a] >= 0 and s.sign[a] * u[a, END] < form.lo[a]:
+            found = step_control.first_wrong(u[a], s.sign[a], pace.tol)
+            if found > 1 and 1.1 * POINTS[found] < 1.0:
+                step.too_far = min(step.too_far, 1.1 * POINTS[found])
     step.unconverged += int(step.converged == 0)
     # The error of a shorter step says nothing about the length at which the iteration converges.
     step.trusted = step.converged
@@ -313,68 +316,12 @@ def refuse(c: ManyAreas, s: LoopState) -> int:
     return readout.NO_STEP if stuck or lost or (step.whole > 0 and 1.0 / step.grown < _NEAR_FOLD) else readout.GO_ON
 
 
-@jit
-def beyond(c: ManyAreas, pace: Pace, s: LoopState) -> float:
-    """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
-
-    There the branch of an area has no meaning, and the error says nothing.
-    """
-    form, u, end = c.form, c.work.areas[forms.U], 1.0
-    for a in range(c.sign.size):
-        if form.cell[a] >= 0 and c.sign[a] * u[a, END] < form.lo[a]:
-            found = step_control.first_wrong(u[a], c.sign[a], pace.tol)
-            if found > 1:
-                end = min(end, 1.1 * POINTS[found])
-    return end if end < 1.0 else 2.0
-
-
 @jit_within
-def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
-    """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
-    work, step, control, t = c.work, s.step[0], s.control[0], s.control[0].t
-    h, stop = step.length, step.stop
-    step.t_new, step.theta, step.crossed = t + h, 1.0, -1
-    if step.t_new >= stop or stop - step.t_new <= 1e-12 * h:
-        step.t_new, step.theta = stop, min(1.0, (stop - t) / h)
-    u, turned_enough = work.modal.u, step.flips > c.sign.size
-    _cut_at_zero(c, pace, s, turned_enough)
-    a = step.crossed
-    if a >= 0 and step.t_new <= t:
-        c.sign[a], c.branch[a, 0], c.branch[a, 1] = -c.sign[a], t, math.inf
-        step.flips += 1
-        return readout.AGAIN
-    if turned_enough:
-        off = 0.0
-        for b in range(c.sign.size):
-            if c.form.cell[b] >= 0:
-                off = max(off, step_control.farthest_off(u[b], c.sign[b], step.theta))
-        if off > pace.tol and readout.may_shorten(s, t):
-            return readout.AGAIN
-    if c.form.mobile and step.whole == 0:
-        step.grown = _magnified_whole(c, s)
-        _take_coupling(c, s, h)
-    if not 0.0 < step.grown < math.inf:
-        return readout.NO_STEP
-    control.magnified = max(control.magnified, step.grown)
-    step.flips = 0
-    _finish(c, pace.charge, s, t)
-    if a >= 0:
-        _cross(c, s, a)
-    control.t = step.t_new
-    s.counters[readout.ACCEPTED] += 1
-    return readout.GO_ON
-
-
-@jit_within
-def _cut_at_zero(c: ManyAreas, pace: Pace, s: LoopState, later: bool) -> None:
-    """End a step where a gap voltage first leaves its branch; if `later`, zeros at the step's start are passed over."""
-    step, u, t, series = s.step[0], c.work.modal.u, s.control[0].t, c.work.room[0]
-    for a in range(c.sign.size):
-        if c.form.cell[a] >= 0:
-            crossing = step_control.leaves(u[a], c.sign[a], pace.tol, series)
-            reached = t + crossing * step.length
-            if crossing <= step.theta and reached <= step.t_new and not (later and reached <= t):
-                step.crossed, step.theta, step.t_new = a, crossing, reached
+def crossing(c: ManyAreas, pace: Pace, s: LoopState, a: int) -> float:
+    """Fraction of an accepted step at which the gap voltage of area a leaves its branch, or 2."""
+    if c.form.cell[a] < 0:
+        return 2.0
+    return float(step_control.leaves(c.work.modal.u[a], s.sign[a], pace.tol, c.work.room[0]))
 
 
 @jit
@@ -385,7 +332,7 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
     """
     form, work, spare = c.form, c.work, c.work.spare_cells
     _take_coupling(c, s, 0.0)
-    forms.clear(spare[forms.ETA])
+    spare[forms.ETA] = 0.0
     multiply(work.own.held, work.modal.w[: form.shape.shape[0]], None, spare[forms.CHI])
     combine(work.own.from_slopes, work.s, 0, spare[forms.CHI])
     forms.answer_mobile(form, work, s.step[0].several > 0, spare, work.areas, work.room[3])
@@ -394,21 +341,27 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
 
 
 @jit_within
-def _finish(c: ManyAreas, charge: bool, s: LoopState, t: float) -> None:
-    """Charges, outputs, peaks and errors of a step that began at t (s, or a fraction of a jump), and its end."""
+def finish(c: ManyAreas, charge: bool, s: LoopState) -> int:
+    """Charges, outputs, peaks and errors of a step, and the state at its end or where it is cut."""
     form, work, step, x, values = forms.form_of(c, s), c.work, s.step[0], c.work.modal, c.work.modal.values
     n_y, n_s, theta, before, jump = s.y.size, c.s_before.size, step.theta, c.s_before, work.jump
+    if form.mobile and step.whole == 0:
+        step.grown = _magnified_whole(c, s)
+        _take_coupling(c, s, step.length)
+    if not 0.0 < step.grown < math.inf:
+        return readout.NO_STEP
+    s.control[0].magnified = max(s.control[0].magnified, step.grown)
     readout.basis_at(theta, x.basis)
     if charge:
         z, h = values[n_y - n_s : n_y], step.length
-        errors.step_charges(form, work, h, c.integral, c.sign, z, values[n_y:])
+        errors.step_charges(form, work, h, c.integral, s.sign, z, values[n_y:])
         errors.charge_error(form, work, c.tables.lobes, h, theta, z, s.collected, s.control[0])
     for e in range(n_s):
         work.gained[e] = readout.at(values[n_y - n_s + e], x.basis) if charge else 0.0
     if step.in_jump == 0:
         errors.write_columns(form.shape, form.follow, x.w, work.s, s.y, charge, values)
-        readout.write_step(s, t, x)
-    for a in range(c.sign.size):
+        readout.write_step(s, s.control[0].t, x)
+    for a in range(s.sign.size):
         if form.stress[a] > 0.0:
             area_off = 0.0
             if form.slow[a] >= 0:
@@ -426,19 +379,7 @@ def _finish(c: ManyAreas, charge: bool, s: LoopState, t: float) -> None:
     else:
         at_sources(c.sources, work.segment, step.t_new, 0.0, before, work.slopes_now)
     errors.store(form.shape, form.follow, x.w0, before, work.gained, s.y)
-
-
-@jit_within
-def _cross(c: ManyAreas, s: LoopState, a: int) -> None:
-    """Change the branch of area a at a zero of its gap voltage, which ends a step."""
-    control, branch, t_new = s.control[0], c.branch, s.step[0].t_new
-    c.sign[a] = -c.sign[a]
-    branch[a, 0], branch[a, 1] = t_new, t_new - branch[a, 0]
-    s.counters[readout.ZEROS] += 1
-    # The area has a kink here, which excites the fast modes again.
-    if control.h_after_zero > 0.0:
-        control.h, control.allowed = control.h_after_zero, 0.0
-    s.step[0].fresh = step_control.AFTER_ZERO
+    return readout.GO_ON
 
 
 @jit

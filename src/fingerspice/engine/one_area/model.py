@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.network import Segment, on_branch, source
+from fingerspice.engine.network import on_branch, source
 from fingerspice.physics.contact import inverse_area
 
 
@@ -294,6 +294,6 @@ def source_at(
     for i in range(t.size):
         while index < edges.size - 2 and (t[i] > edges[index + 1] or (t[i] == edges[index + 1] and not left[i])):
             index += 1
-        segment = Segment(edges[index], edges[index + 1] - edges[index], terms[index], series[index])
-        u[i], slope[i] = source(segment, t[i] - edges[index])
+        length, tau = edges[index + 1] - edges[index], t[i] - edges[index]
+        u[i], slope[i] = source(terms[index], series[index], length, tau)
     return u, slope

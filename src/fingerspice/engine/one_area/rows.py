@@ -73,7 +73,7 @@ def source_rows(
     terms: FloatArray, series: FloatArray, length: float, t0: float, h: float, want_slope: bool, out: FloatArray,
     slope: FloatArray, scratch: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill source, and its slope if wanted, for a step of length h that starts t0 into a segment (see `Segment`)."""
+    """Fill source, and its slope if wanted, for a step of length h that starts t0 into a segment (see `source`)."""
     phase, rate = scratch[0], scratch[1]
     for i in range(ROWS):
         out[i] = 0.0
@@ -204,7 +204,7 @@ def evaluate_one(c: Any, s: Any, w: FloatArray, pull: FloatArray, probing: bool)
     stay as they are. False where, under `mobile`, the area equation was not solved on the branch connected to the guess
     of the gap voltage.
     """
-    system, level, sign, tapped = c.system, s.step[0].level, s.control[0].sign, c.work.tapped
+    system, level, sign, tapped = c.system, s.step[0].level, s.sign[0], c.work.tapped
     model, r = system.model, c.work.spare_r if probing else c.work.r
     mobile, q0 = model.mobile, system.q0[level]
     if probing:

@@ -17,13 +17,13 @@ from fingerspice.engine.collocation import exponential, readout, step_control
 from fingerspice.engine.collocation.exponential import Tables, between, largest
 from fingerspice.engine.collocation.readout import N_PLACES, LoopState
 from fingerspice.engine.collocation.step_control import Pace
-from fingerspice.engine.network import Segment, Sources, on_branch, source
+from fingerspice.engine.network import Sources, on_branch, source
 from fingerspice.engine.one_area import rows
 from fingerspice.engine.one_area.charge import charge_step
 from fingerspice.engine.one_area.model import dot, turns_at_zero
 from fingerspice.engine.one_area.rows import DQ, GUESS, SCRATCH, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.one_area.system import System
-from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS, SECOND, THIRD, multiply
+from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS, SECOND, THIRD, combine, multiply
 from fingerspice.numerics.modes import apply
 
 # A gap voltage below this fraction of the one at the next node counts as 0.
@@ -76,7 +76,7 @@ def begin(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
     apply(c.system.project[step.level], s.y, c.work.modal.w0)
     length = step.stop - step.start
     step.length = step_control.choose_step(
-        pace, model.tau, model.coupled, c.sources.series.shape[1] > 0, t, length - step.since, control
+        pace, model.tau, c.sources.series.shape[1] > 0, s.branch, length - step.since, control
     )  # fmt: skip
     return readout.GO_ON
 
@@ -88,7 +88,8 @@ def _enter_segment(c: OneArea, pace: Pace, s: LoopState) -> bool:
     # Time is counted from the edge: a transient after it may be faster than the rounding of t.
     step.since = control.t - step.start
     step.begun, step.evaluated = control.t, s.counters[readout.NFEV]
-    if not step_control.enter(c.system.model, pace.charge, source_voltage(c, s, step.since), s.y, control):
+    u = source_voltage(c, s, step.since)
+    if not step_control.enter(c.system.model, pace.charge, u, s.y, control, s.sign, s.branch):
         return False
     # Try the step that was right after the edge before: similar jumps often need similar steps.
     control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
@@ -99,8 +100,8 @@ def _enter_segment(c: OneArea, pace: Pace, s: LoopState) -> bool:
 @jit_within
 def source_voltage(c: OneArea, s: LoopState, tau: float) -> float:
     """Source voltage (V) `tau` s into the segment at hand."""
-    index, start = s.step[0].index, s.step[0].start
-    u, _ = source(Segment(start, s.step[0].edge - start, c.sources.terms[index], c.sources.series[index]), tau)
+    step = s.step[0]
+    u, _ = source(c.sources.terms[step.index], c.sources.series[step.index], step.edge - step.start, tau)
     return u
 
 
@@ -112,7 +113,7 @@ def _take_level(c: OneArea, s: LoopState) -> None:
     if system.q0.size > 1:
         q = s.control[0].last_q
         if step.fresh == step_control.AFTER_EDGE or not q > 0.0:
-            q, _ = on_branch(system.model.mobile, system.model.curve, s.control[0].sign, s.control[0].u_gap)
+            q, _ = on_branch(system.model.mobile, system.model.curve, s.sign[0], s.control[0].u_gap)
         now = step_control.nearest_level(system.q0, q)
     if now == step.level:
         return
@@ -129,7 +130,7 @@ def _take_level(c: OneArea, s: LoopState) -> None:
 def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
     system, x, step, control, counters = c.system, c.work.modal, s.step[0], s.control[0], s.counters
-    model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.control[0].sign
+    model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.sign[0]
     h, u_rows = step.length, r[U]
     if h != step.tabled:
         exponential.take_tables(c, s, level, h, system.rates[level], system.gap[level])
@@ -154,7 +155,7 @@ def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
         if turns_at_zero(model, r[X_GAP, 0], -sign):
             control.margin = 0.0
             return readout.NO_STEP
-        return flip(s)
+        return step_control.turn(s, 0)
     step.below = step_control.dip(u_rows, sign, tol, step.wrong, x.coefficients[0]) if model.coupled and closed else 0.0
     if 0.0 < step.below < POINTS[1] and at_zero:
         # The gap voltage starts at a zero and soon returns to it: a shorter step resolves this.
@@ -211,18 +212,15 @@ def _assess(c: OneArea, s: LoopState) -> tuple[float, float]:
 
 
 @jit_within
-def flip(s: LoopState) -> int:
-    """Change the branch of the area, and start again."""
-    s.control[0].sign = -s.control[0].sign
-    s.step[0].flips += 1
-    return readout.AGAIN
+def refuse(c: OneArea, pace: Pace, s: LoopState) -> int:
+    """Why no shorter step would do after one that was rejected; GO_ON if one may.
 
-
-@jit_within
-def refuse(c: OneArea, s: LoopState) -> int:
-    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
+    `too_far` is set to the fraction of it at which the next one should end, soon after a zero far beyond which it went,
+    as there the branch of an area has no meaning, and the error says nothing; or to 2.
+    """
     system, step, r = c.system, s.step[0], c.work.r
-    model = system.model
+    model, wrong = system.model, step.wrong
+    step.too_far = 1.1 * POINTS[wrong] if wrong > 1 and s.sign[0] * r[U, END] < system.lo else 2.0
     # A step rejected beyond the end of the area's polynomial: shorter ones would creep up to the kink there.
     if model.coupled and abs(s.control[0].u_gap) > 0.9 * system.u_top and rows.largest_size(r[U]) > system.u_top:
         return readout.OUT_OF_RANGE
@@ -234,16 +232,6 @@ def refuse(c: OneArea, s: LoopState) -> int:
     return readout.GO_ON
 
 
-@jit_within
-def beyond(c: OneArea, pace: Pace, s: LoopState) -> float:
-    """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
-
-    There the branch of the area has no meaning, and the error says nothing.
-    """
-    wrong, u = s.step[0].wrong, c.work.r[U]
-    return 1.1 * POINTS[wrong] if wrong > 1 and s.control[0].sign * u[END] < c.system.lo else 2.0
-
-
 @jit
 def _node_error(c: OneArea, level: int) -> float:
     """Largest error of any node's voltage over a step (V) from that of the modes; see `_assess`.
@@ -251,78 +239,50 @@ def _node_error(c: OneArea, level: int) -> float:
     Under `mobile` the voltages are the modes times 1/A: their error contains that of A, and the interpolation error of
     the product.
     """
-    system, r, w, places, brief = c.system, c.work.r, c.work.modal.w, c.work.modal.places, c.work.modal.brief
-    node, k_node, gap, area0 = system.node[level], system.k_node, system.gap[level], system.model.area0
+    system, r, x, node_s = c.system, c.work.r, c.work.modal, c.system.k_node[:, np.newaxis]
+    area0, gap, n = system.model.area0, system.gap[level], x.w.shape[0]
     if not system.model.mobile:
-        return exponential.node_error(node, k_node[:, np.newaxis], places, c.work.off)
-    own, missed, values = np.zeros((places.shape[0], N_PLACES)), np.zeros(N_PLACES), np.zeros(ROWS)
-    moved = np.zeros(N_PLACES)
+        return exponential.node_error(system.node[level], node_s, x.places, c.work.off)
+    own, values, moved = np.zeros((n, N_PLACES)), np.zeros(ROWS), np.zeros(N_PLACES)
     for p in range(N_PLACES):
         row = readout.row_of(p)
-        for k in range(gap.size):
-            own[k, p] = area0 * r[Q, row] * places[k, p] - area0 * r[Q, row] * brief[k, p]
+        scale = area0 * r[Q, row]
+        for k in range(n):
+            own[k, p] = scale * (x.places[k, p] - x.brief[k, p])
             moved[p] += gap[k] * own[k, p]
         moved[p] *= area0 * r[DQ, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
-    worst = 0.0
-    for i in range(k_node.size):
+    for k in range(n):
         for j in range(ROWS):
-            values[j] = 0.0
-            for k in range(gap.size):
-                values[j] += node[i, k] * w[k, j]
-            values[j] *= area0 * r[Q, j]
-            values[j] += k_node[i] * r[SOURCE, j]
-        missed[1], missed[2], missed[3] = between(c.tables.lobes, values)
+            values[j] = area0 * r[Q, j] * x.w[k, j]
+        missed = between(c.tables.lobes, values)
         for p in range(N_PLACES):
-            total = missed[p]
-            for k in range(gap.size):
-                total += node[i, k] * (own[k, p] + moved[p] * w[k, readout.row_of(p)])
-            worst = max(worst, abs(total))
-    return worst
+            own[k, p] += moved[p] * x.w[k, readout.row_of(p)] + (missed[p - 1] if 0 < p < N_PLACES - 1 else 0.0)
+    return exponential.node_error(system.node[level], node_s, own, c.work.off)
 
 
 @jit_within
-def complete(c: OneArea, pace: Pace, s: LoopState) -> int:
-    """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
-    step, control, t = s.step[0], s.control[0], s.control[0].t
-    h, since, length = step.length, step.since, step.stop - step.start
-    reached = since + h
-    step.theta, step.crossed = 1.0, -1
-    if reached >= length or length - reached <= 1e-12 * h:
-        reached = length
-        step.theta = min(1.0, (length - since) / h)
-    if step.wrong > 0 or step.below > 0.0:
-        crossing = step_control.zero(c.work.r[U], control.sign, step.wrong, step.below, c.work.modal.coefficients[0])
-        if since + crossing * h <= since:
-            if step.flips < 2:
-                return flip(s)
-            if step_control.farthest_off(c.work.r[U], control.sign, step.theta) > pace.tol and readout.may_shorten(
-                s, since
-            ):
-                return readout.AGAIN
-        elif since + crossing * h <= reached and crossing <= step.theta:
-            step.theta, reached, step.crossed = crossing, since + crossing * h, 0
-    step.flips = 0
-    step.t_new = step.stop if reached == length else step.start + reached
-    _finish(c, pace.charge, s, t)
-    if step.crossed >= 0 and not _cross(c, s):
-        return readout.NO_STEP
-    control.t, step.since = step.t_new, reached
-    if control.t >= step.stop:
-        control.u_before = source_voltage(c, s, control.t - step.start)
-    s.counters[readout.ACCEPTED] += 1
-    return readout.OUT_OF_RANGE if s.peaks[0, readout.PEAK_U] > c.system.u_top else readout.GO_ON
+def crossing(c: OneArea, pace: Pace, s: LoopState, a: int) -> float:
+    """Fraction of an accepted step at which the gap voltage leaves its branch, or 2."""
+    wrong, below = s.step[0].wrong, s.step[0].below
+    if wrong == 0 and below == 0.0:
+        return 2.0
+    return float(step_control.zero(c.work.r[U], s.sign[0], wrong, below, c.work.modal.coefficients[0]))
 
 
 @jit_within
-def _finish(c: OneArea, charge: bool, s: LoopState, t: float) -> None:
-    """Charge, outputs, peaks and errors of a step that began at t (s), and the state at its end or where it is cut."""
+def finish(c: OneArea, charge: bool, s: LoopState) -> int:
+    """Charge, outputs, peaks and errors of a step, and the state at its end or where it is cut."""
     system, r, step, control, x, y = c.system, c.work.r, s.step[0], s.control[0], c.work.modal, s.y
     model, shown, values, theta = system.model, system.shown[step.level], x.values, step.theta
     n_shown = shown.shape[0]
     if charge:
         charge_step(c, s, values[n_shown], values[n_shown + 1])
-    readout.layers(model.mobile, model.area0, system.k_shown, shown, x.w, r[SOURCE], r[Q], values)
-    readout.write_step(s, t, x)
+    multiply(shown, x.w, None, values)
+    for i in range(n_shown if model.mobile else 0):
+        for j in range(ROWS):
+            values[i, j] *= model.area0 * r[Q, j]
+    combine(system.k_shown[:, np.newaxis], r[SOURCE : SOURCE + 1], 0, values)
+    readout.write_step(s, control.t, x)
     control.magnified = max(control.magnified, step.grown)
     for i in range(ROWS):
         r[SCRATCH, i] = 1.0 / r[Q, i]
@@ -338,28 +298,12 @@ def _finish(c: OneArea, charge: bool, s: LoopState, t: float) -> None:
     control.last_q = readout.at(r[Q], x.basis)
     control.u_gap = 0.0 if step.crossed >= 0 else readout.at(r[U], x.basis)
     apply(system.live[step.level], x.w0, y)
-
-
-@jit_within
-def _cross(c: OneArea, s: LoopState) -> bool:
-    """Change the branch at a zero of the gap voltage, which ends a step; False at a fold there."""
-    step, control, model, t_new = s.step[0], s.control[0], c.system.model, s.step[0].t_new
-    control.sign = -control.sign
-    control.branch_length, control.branch_start = t_new - control.branch_start, t_new
-    s.counters[readout.ZEROS] += 1
-    if turns_at_zero(model, dot(model.gap, s.y), control.sign):
-        control.t = t_new
-        control.sign = -control.sign
-        control.margin = 0.0
-        return False
-    # The area has a kink here, which excites fast modes again: the first step is chosen as after other zeros.
-    if step.below > 0.0:
-        # The gap voltage returns to 0 V soon.
-        control.h, control.allowed = 2.0 * (step.below - step.theta) * step.length, 0.0
-    elif control.h_after_zero > 0.0:
-        control.h, control.allowed = control.h_after_zero, 0.0
-    step.fresh = step_control.AFTER_ZERO
-    return True
+    if step.crossed >= 0 and turns_at_zero(model, dot(model.gap, y), -s.sign[0]):
+        control.t, control.margin = step.t_new, 0.0
+        return readout.NO_STEP
+    if step.t_new >= step.stop:
+        control.u_before = source_voltage(c, s, step.t_new - step.start)
+    return readout.OUT_OF_RANGE if s.peaks[0, readout.PEAK_U] > system.u_top else readout.GO_ON
 
 
 @jit_within
