@@ -114,7 +114,7 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
         how = (halves, half, count if jumping else 0, periodic, tol, covered)
         scenes, none = (table, pending, (gap, leaks), (series, nodes, matrix)), columns[5][:0]
         block = (columns, scratch, stepping)
-        integrate(scenes, first, (tones, (coarse, fine)), how, block, out, (none, none), marks)
+        integrate(scenes, first, (tones, (coarse, fine), False), how, block, out, (none, none), marks)
 
     return kernel
 

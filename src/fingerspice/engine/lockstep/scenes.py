@@ -266,7 +266,9 @@ def put_result(
     out[-1, at] = found[6][i] if peak <= found[5][i] else math.inf
 
 
-def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int, ...], ...], ...]:
+def block_shapes(
+    rows: int, pieces: int, marks: Marks, portions: int = 1
+) -> tuple[tuple[tuple[int, ...], ...], ...]:  # fmt: skip
     """Shapes of a block's arrays, for a table with so many rows and half periods of so many pieces (4 without jumps).
 
     They are in three groups: what `fill_block` finds, its scratch, and what `march.march_block` steps with.
@@ -292,7 +294,7 @@ def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int,
     stepping = (
         (weights,), (pieces, weights),  # Weights, as `step.run` takes them
         (n_state(m, k, count) * lanes,),  # State
-        (count * lanes,),  # Sums over the last period
+        (portions * count * lanes,),  # Sums over the last period, or each portion of a recording
         modes,  # Modes at the start of the last period
         # In the search for the periodic state, the derivative of the start by what a period leaves open, with the area
         # held. In a run from rest, an upper bound of the modes' time constants, in periods.
@@ -302,14 +304,14 @@ def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int,
         lane,
         # Length of the shortest step, s; in a run from rest, then the number of half periods after which it has settled
         lane,
-        (9, lanes),  # Scratch of `step.weigh`
+        (9, lanes),  # Scratch of `step.weigh` and `step.run`
     )  # fmt: skip
     return found, scratch, stepping
 
 
-def new_block(rows: int, pieces: int, marks: Marks) -> tuple[Any, Any, Any]:
+def new_block(rows: int, pieces: int, marks: Marks, portions: int) -> tuple[Any, Any, Any]:
     """Arrays for blocks of scenes; `pieces` is 0 without jumps."""
-    shapes = block_shapes(rows, pieces or 4, marks)
+    shapes = block_shapes(rows, pieces or 4, marks, portions)
     arrays = iter(aligned(shape for group in shapes for shape in group))
     found, scratch, stepping = (tuple(islice(arrays, len(group))) for group in shapes)
     return found, (*scratch, np.empty((2, len(marks[0]) + 1), np.int64)), stepping
