@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.lockstep import step as lockstep
-from fingerspice.engine.lockstep.scenes import CELL_ROWS, OMEGA, Scenes, fill_block, put_result
+from fingerspice.engine.lockstep.scenes import CELL_ROWS, OMEGA, Scenes, fill_block
 from fingerspice.engine.lockstep.step import Marks, area_row, run, weigh
 
 # Most periods in the search for the periodic state.
@@ -37,47 +35,26 @@ How = tuple[
 
 
 @jit
-def _closed(
-    s: FloatArray, start: FloatArray, back: FloatArray, c: FloatArray, closing: FloatArray, tol: float, marks: Marks
-) -> bool:  # fmt: skip
-    """Whether a period leads every lane from its start back to it, to `tol`; if not, improve the starts.
+def _off(i: int, c: FloatArray, stepping: Any, steps: int, periodic: bool, traced: bool, marks: Marks) -> float:
+    """What a range of the run of lane i has left open, relative to its peak gap voltage or to its mean force.
 
-    The improvement is a step of Newton's method with the derivative of the period map with the area held. A lane that
-    is within `tol` (relative to its peak gap voltage) keeps its start.
+    For the periodic state this is the change that a step of Newton's method makes to the gap voltage at the start, with
+    the derivative of the period map with the area held. In a run from rest it is half of what the mean force is off if
+    the last period stands for all that follow: what a mode was off the periodic state, on average over the period, is
+    at most its change over the period times its time constant in periods, and so is what it changes in all later ones.
+    The mean force changes by at most twice the peak voltage times this, and the area; `steps` is the number of steps of
+    a period. If gap voltages are wanted, then at least what these change, relative to their peak.
     """
-    m_all, lanes, done = len(marks[0]), len(marks[5]), True
-    for i in range(lanes):
-        off = 0.0
-        for m in range(m_all):
-            change = (s[(lockstep.Z * m_all + m) * lanes + i] - start[m * lanes + i]) * back[m * lanes + i]
-            off += abs(c[(lockstep.SHAPE + m) * lanes + i] * change)
-        closing[i] = off / (s[(lockstep.N_STATE * m_all + lockstep.PEAK) * lanes + i] + 1e-300)
-        if closing[i] > tol:
-            done = False
-            for m in range(m_all):
-                change = s[(lockstep.Z * m_all + m) * lanes + i] - start[m * lanes + i]
-                start[m * lanes + i] += change * back[m * lanes + i]
-    return done
-
-
-@jit
-def _settled(i: int, c: FloatArray, stepping: Any, steps: int, traced: bool, marks: Marks) -> float:
-    """Half of what lane i's mean force is off, relative to it, if the last period stands for all that follow.
-
-    What a mode was off the periodic state, on average over the period, is at most its change over the period times its
-    time constant in periods, and so is what it changes in all later ones. The mean force changes by at most twice the
-    peak voltage times this, and the area; `steps` is the number of steps of a period. If gap voltages are wanted, then
-    at least what these change, relative to their peak.
-    """
-    _, _, s, last, before, back, _, _, _ = stepping
+    _, s, last, before, back, _, _, _ = stepping
     m_all, lanes = len(marks[0]), len(marks[5])
     off, held = 0.0, area_row(m_all, len(marks[1]), len(marks[2])) + len(marks[3]) - 1
     for m in range(m_all):
         at = m * lanes + i
-        off += abs(c[(lockstep.SHAPE + m) * lanes + i] * (s[lockstep.Z * m_all * lanes + at] - before[at]) * back[at])
+        change = (s[lockstep.Z * m_all * lanes + at] - before[at]) * back[at]
+        off += abs(c[(lockstep.SHAPE + m) * lanes + i] * change)
     peak = s[(lockstep.N_STATE * m_all + lockstep.PEAK) * lanes + i]
-    of_force = off * peak / (last[i] / steps * c[held * lanes + i] + 1e-300)
-    return float(max(of_force, off / (peak + 1e-300)) if traced else of_force)
+    of_force, of_voltage = off * peak / (last[i] / steps * c[held * lanes + i] + 1e-300), off / (peak + 1e-300)
+    return float(of_voltage if periodic else max(of_force, of_voltage) if traced else of_force)
 
 
 @jit
@@ -85,19 +62,21 @@ def _integrate(
     found: Any, stepping: Any, wave: FloatArray, how: tuple[int, int, int, bool, bool, float], trace: FloatArray,
     out: FloatArray, first: int, marks: Marks,
 ) -> None:  # fmt: skip
-    """Run a block's scenes range by range, with weights that are known.
+    """Run a block's scenes range by range, with weights that are known, and write their columns of `out`.
 
-    In search of the periodic state the one range is the run, again and again. A run from rest has periods, of which
-    the first may be half a one; a scene that has settled takes part in further ones only if others of its block do, and
-    its results stay those at which it settled: no result depends on the scenes beside it. A recording has portions,
-    whose sums are all kept. `how` is as `How`, but for steps in the run's half periods, and with whether the source is
-    recorded in front of the tolerance.
+    In search of the periodic state the one range is the run, again and again, until it leads every lane from its start
+    back to it; a lane that does so keeps its start. A run from rest has periods, of which the first may be half a one;
+    a scene that has settled takes part in further ones only if others of its block do, and its results stay those at
+    which it settled: no result depends on the scenes beside it. A recording has portions, whose sums are all kept.
+    `how` is as `How`, but for steps in the run's half periods, and with whether the source is recorded in front of the
+    tolerance.
     """
     halves, steps, pieces, periodic, recorded, tol = how
-    c, start, _, _, _, _, _ = found
-    still, moving, s, last, before, back, closing, settled, line = stepping
-    m_all, size, lanes = len(marks[0]), len(marks[4]) * len(marks[5]), len(marks[5])
-    sums, ends = (lockstep.N_STATE * m_all + lockstep.VALUE) * lanes + size, N_PORTION if recorded else halves
+    c, start, _, _, _, covered, tails = found
+    g, s, last, before, back, closing, settled, line = stepping
+    m_all, count, lanes = len(marks[0]), len(marks[4]), len(marks[5])
+    own, size, ends = lockstep.N_STATE * m_all, count * lanes, N_PORTION if recorded else halves
+    sums, of_part = (own + lockstep.VALUE) * lanes + size, (halves if recorded else 2) * steps
     for i in range(lanes):
         closing[i] = math.inf
     done, left, turns = 0, lanes, 0
@@ -112,45 +91,54 @@ def _integrate(
         for i in range(size):
             last[place + i] = math.nan if half_of_period and not recorded else -s[sums + i]
         way = (done * halves // ends * steps, upto * halves // ends * steps, steps, pieces, recorded)
-        run(c, (still, moving[: pieces or 4]), s, wave, way, line, trace, marks)
+        run(c, g, s, wave, way, line, trace, marks)
         for i in range(size):
             last[place + i] += s[sums + i]
-        done, turns = upto, turns + 1
-        again = periodic and not _closed(s, start, back, c, closing, tol, marks) and turns < MOST_PERIODS
+        done, turns, again = upto, turns + 1, False
+        ahead = (ends - done) // 2
         for i in range(lanes):
-            if periodic or closing[i] == math.inf:
-                off = closing[i] if periodic else 0.0
-                if done < ends:
-                    off = math.inf if recorded else _settled(i, c, stepping, 2 * steps, trace.size > 0, marks)
-                if done == ends or off <= tol:
-                    closing[i], settled[i] = off, done
-                    left -= 1
-                    lengths = ((ends - done) // 2, halves * steps, (halves if recorded else 2) * steps)
-                    put_result(i, s, last, off, lengths, found, first, out, marks)
+            if closing[i] < math.inf and not periodic:
+                continue
+            off = 0.0 if done == ends else math.inf
+            if periodic or (done < ends and not recorded):
+                off = _off(i, c, stepping, 2 * steps, periodic, trace.size > 0, marks)
+            if periodic and off > tol:
+                again = turns < MOST_PERIODS
+                for at in range(i, m_all * lanes, lanes):
+                    start[at] += (s[lockstep.Z * m_all * lanes + at] - before[at]) * back[at]
+            # After half a period it is not a number.
+            if done < ends and not off <= tol:
+                continue
+            closing[i], settled[i], left = off, done, left - 1
+            for j in range(count if first + i < out.shape[1] else 0):
+                total, peak = s[sums + j * lanes + i], s[(own + lockstep.PEAK) * lanes + i]
+                if ahead > 0:
+                    total += ahead * last[j * lanes + i]
+                out[j, first + i] = total / (halves * steps)
+                for k in range(j, out.shape[0] - 3 - count, count):
+                    out[count + k, first + i] = last[k * lanes + i] / of_part
+                out[-3, first + i], out[-2, first + i] = peak, off
+                out[-1, first + i] = tails[i] if peak <= covered[i] else math.inf
         if again:
             done, left = 0, lanes
-    width = trace.size // lanes
-    for i in range(lanes if width > 0 else 0):
+    for i in range(min(lanes, trace.shape[0]) if trace.size > 0 else 0):
         # The last period, again and again.
-        for j in range(i * width + int(settled[i]) * steps, (i + 1) * width):
-            trace[j] = trace[j - 2 * steps]
+        for j in range(int(settled[i]) * steps, trace.shape[1]):
+            trace[i, j] = trace[i, j - 2 * steps]
 
 
 @jit
 def march_block(
     scenes: Scenes, first: int, source: Source, how: How, block: tuple[Any, Any, Any], out: FloatArray,
-    voltages: tuple[FloatArray, FloatArray], marks: Marks,
+    traces: tuple[FloatArray, FloatArray], marks: Marks,
 ) -> None:  # fmt: skip
-    """Integrate as many scenes as there are lanes, from number `first` on; see `march`.
-
-    `voltages` take the gap voltages before the steps of both runs, each of shape (lanes * steps,) or (0,).
-    """
+    """Integrate as many scenes as there are lanes, from number `first` on; see `march`."""
     halves, half, pieces, periodic, tol, covered = how
     m_all, lanes, lines = len(marks[0]), len(marks[5]), pieces > 0
     # Unpacked by position, as a compiler for graphics cards may know plain tuples only.
     found, scratch, stepping = block
     _, _, rates, drive, t, _, _ = found
-    still, moving, _, _, _, back, _, length, moments = stepping
+    g, _, _, _, back, _, length, moments = stepping
     omega = (CELL_ROWS * (m_all + 1) + OMEGA) * lanes
     fill_block(scenes, first, (source[0], lines, covered), found, scratch, marks)
     for i in range(lanes):
@@ -168,9 +156,9 @@ def march_block(
         shorter = pieces / (2.0**pieces - 1.0) if lines else lockstep.START_TIMES[2]
         for i in range(lanes):
             length[i] = math.pi / t[omega + i] / steps * shorter
-        weigh(length, rates, drive, (still, moving[: pieces or 4]), moments, marks)
+        weigh(length, rates, drive, g[: 1 + (pieces or 4)], moments, marks)
         way = (halves, steps, pieces, periodic, source[2], tol)
-        _integrate(found, stepping, wave, way, voltages[w], out[w], first, marks)
+        _integrate(found, stepping, wave, way, traces[w][first:], out[w], first, marks)
 
 
 @jit
@@ -186,11 +174,5 @@ def march(
     cover the voltages met. The `traces` (n, steps) take the gap voltage before every step of each run, V; they are
     (n, 0) for none.
     """
-    lanes, n = len(marks[5]), scenes[1].size
-    voltages = np.empty(lanes * traces[0].shape[1]), np.empty(lanes * traces[1].shape[1])
-    for first in range(0, n, lanes):
-        march_block(scenes, first, source, how, block, out, voltages, marks)
-        for w in range(2):
-            width = traces[w].shape[1]
-            for i in range(min(lanes, n - first) if width > 0 else 0):
-                traces[w][first + i] = voltages[w][i * width : (i + 1) * width]
+    for first in range(0, scenes[1].size, len(marks[5])):
+        march_block(scenes, first, source, how, block, out, traces, marks)

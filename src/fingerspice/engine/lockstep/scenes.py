@@ -240,32 +240,6 @@ def _respond(
                 c[(of_u + 2 * tone + 1) * lanes + i] = u_cosine
 
 
-@jit
-def put_result(
-    i: int, s: FloatArray, parts: FloatArray, closing: float, lengths: tuple[int, int, int], found: Any, first: int,
-    out: FloatArray, marks: Marks,
-) -> None:  # fmt: skip
-    """Write lane i's column of `out`, which `march.march` describes; `parts` are the sums over parts of the run.
-
-    `lengths` are how often the last part stands for others beside itself; steps of the run; and steps of a part, or of
-    the run, of which each part then has its share.
-    """
-    own, count, lanes = lockstep.N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
-    ahead, steps, of_part = lengths
-    at, peak = first + i, s[(own + lockstep.PEAK) * lanes + i]
-    if at >= out.shape[1]:
-        return
-    for j in range(count):
-        total = s[(own + lockstep.VALUE + count + j) * lanes + i]
-        if ahead > 0:
-            total += ahead * parts[j * lanes + i]
-        out[j, at] = total / steps
-        for k in range(j, out.shape[0] - 3 - count, count):
-            out[count + k, at] = parts[k * lanes + i] / of_part
-    out[-3, at], out[-2, at] = peak, closing
-    out[-1, at] = found[6][i] if peak <= found[5][i] else math.inf
-
-
 def block_shapes(
     rows: int, pieces: int, marks: Marks, portions: int = 1
 ) -> tuple[tuple[tuple[int, ...], ...], ...]:  # fmt: skip
@@ -275,7 +249,6 @@ def block_shapes(
     """
     m, w, k, d, count, lanes = (len(mark) for mark in marks)
     lane, modes, cells, both = (lanes,), (m * lanes,), ((m + 1) * lanes,), ((m + 1) * m * lanes,)
-    weights = lockstep.N_WEIGHTS * m * lanes
     found = (
         ((area_row(m, w, k) + d + 1) * lanes,),  # Constants, as `step` takes them
         modes,  # Modes at the start, V
@@ -292,7 +265,7 @@ def block_shapes(
         cells, cells, cells, lane, modes, both, both, (d * lanes,), (2, m + 1), (2, m), (2, m + 1, m), (2, m + 1),
     )  # fmt: skip
     stepping = (
-        (weights,), (pieces, weights),  # Weights, as `step.run` takes them
+        (1 + pieces, lockstep.N_WEIGHTS * m * lanes),  # Weights, as `step.run` takes them
         (n_state(m, k, count) * lanes,),  # State
         (portions * count * lanes,),  # Sums over the last period, or each portion of a recording
         modes,  # Modes at the start of the last period
