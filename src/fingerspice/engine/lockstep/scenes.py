@@ -191,8 +191,8 @@ def _polynomials(
 
 @jit_rows
 def _respond(
-    t: FloatArray, tones: FloatArray, lines: bool, gap: int, leaks: NDArray[np.int64], rates: FloatArray,
-    k: FloatArray, moved: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray, start: FloatArray,
+    t: FloatArray, tones: FloatArray, lines: bool, where: tuple[int, NDArray[np.int64]], rates: FloatArray,
+    k: FloatArray, moved: FloatArray, forms: tuple[FloatArray, FloatArray, FloatArray], start: FloatArray,
     drive: FloatArray, c: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
     """How modes and source act on gap and leaks, into the constants, and the modes at the start.
@@ -201,6 +201,7 @@ def _respond(
     it. Constant pieces and straight lines act on the cells at once, and drive the modes.
     """
     m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
+    (gap, leaks), (gain, feed, shape) = where, forms
     others, of_u = CELL_ROWS * (m_all + 1), lockstep.SHAPE + m_all
     of_w = of_u + w_all
     of_z = of_w + l_all * w_all
@@ -301,7 +302,7 @@ def fill_block(
     """
     m_all, w_all, l_all, d_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[5])
     area = area_row(m_all, w_all, l_all)
-    table, pending, (gap, leaks), curves = scenes
+    table, pending, (gap, _), curves = scenes
     c, start, rates, drive, t, top, tails = found
     k, moved, r, near, gain, feed, shape, values, _, _, _, _, _ = scratch
     for i in range(lanes):
@@ -316,4 +317,5 @@ def fill_block(
     at_rest = c[(area + d_all) * lanes : (area + d_all + 1) * lanes]
     _in_closed_form(k, moved, r, at_rest, rates, near, gain, feed, shape, marks)
     _by_iteration(rates, scratch, marks)
-    _respond(t, source[0], source[1], gap, leaks, rates, k, moved, gain, feed, shape, start, drive, c, marks)
+    forms = gain, feed, shape
+    _respond(t, source[0], source[1], scenes[2], rates, k, moved, forms, start, drive, c, marks)
