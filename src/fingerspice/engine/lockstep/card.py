@@ -81,7 +81,7 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
     modes = lengths[0]
     found, scratches, steppings = block_shapes(rows, pieces or 4, marks)
     (constants,), (cells,), (both,), (points,) = found[0], scratches[0], scratches[5], scratches[7]
-    (row,), (most, _), (states,), (sums,), *_ = steppings
+    (most, row), (states,), (sums,), *_ = steppings
     jumping = pieces > 0
 
     def kernel(
@@ -106,15 +106,15 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
             cuda.local.array(1, np.float64),
         )  # fmt: skip
         stepping = (
-            cuda.local.array(row, np.float64), cuda.local.array((most, row), np.float64),
-            cuda.local.array(states, np.float64), cuda.local.array(sums, np.float64),
-            cuda.local.array(modes, np.float64), cuda.local.array(modes, np.float64), cuda.local.array(1, np.float64),
-            cuda.local.array(1, np.float64), cuda.local.array((9, 1), np.float64),
+            cuda.local.array((most, row), np.float64), cuda.local.array(states, np.float64),
+            cuda.local.array(sums, np.float64), cuda.local.array(modes, np.float64),
+            cuda.local.array(modes, np.float64), cuda.local.array(1, np.float64), cuda.local.array(1, np.float64),
+            cuda.local.array((9, 1), np.float64),
         )  # fmt: skip
         how = (halves, half, count if jumping else 0, periodic, tol, covered)
-        scenes, none = (table, pending, (gap, leaks), (series, nodes, matrix)), columns[5][:0]
+        scenes, none = (table, pending, (gap, leaks), (series, nodes, matrix)), columns[2][:0]
         block = (columns, scratch, stepping)
-        integrate(scenes, first, (tones, (coarse, fine)), how, block, out, (none, none), marks)
+        integrate(scenes, first, (tones, (coarse, fine), False), how, block, out, (none, none), marks)
 
     return kernel
 

@@ -21,14 +21,14 @@ NEAR_POLE = 1e-5
 
 
 @jit_rows
-def find_rates(
+def _in_closed_form(
     k: FloatArray, moved: FloatArray, r: FloatArray, inverse: FloatArray, rates: FloatArray, near: FloatArray,
-    marks: Marks,
+    gain: FloatArray, feed: FloatArray, shape: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
-    """Rates of the cells, into `r`, and of the modes of two or three cells; `inverse` is 1/A.
+    """Rates of the cells, into `r`, and the modes of two or three cells; `inverse` is 1/A.
 
     On entry `r` holds the leakage rates by area. `near` is 1 where a mode's rate is too near to that of a cell, and for
-    more cells, whose modes need an iteration.
+    more cells, whose modes need an iteration. `feed` and `shape` have a row for every mode of every cell.
     """
     m_all, lanes = len(marks[0]), len(marks[5])
     cells = m_all + 1
@@ -45,42 +45,26 @@ def find_rates(
             product = k0 * r1 * r2 + k1 * r0 * r2 + k2 * r0 * r1
             faster = middle + math.sqrt(max(middle * middle - product, 0.0))
             rates[0, i], rates[1, i] = product / faster, faster
-        if m_all <= 2:
-            for m in range(m_all):
-                for j in range(cells):
-                    rate = r[j * lanes + i]
-                    apart = abs(rate - rates[m, i]) > NEAR_POLE * max(rate, rates[m, i])
-                    unclear = unclear if apart else 1.0
+        for m in range(m_all if m_all <= 2 else 0):
+            norm = 0.0
+            for j in range(cells):
+                rate, at = r[j * lanes + i], (j * m_all + m) * lanes + i
+                apart = rate - rates[m, i]
+                unclear = unclear if abs(apart) > NEAR_POLE * max(rate, rates[m, i]) else 1.0
+                feed[at] = 1.0 / apart
+                shape[at] = k[j * lanes + i] * feed[at]
+                norm += shape[at] * feed[at]
+            gain[m * lanes + i] = -1.0 / norm
+            for j in range(cells):
+                feed[(j * m_all + m) * lanes + i] *= -1.0 / norm
         near[i] = unclear
 
 
-@jit_rows
-def _shapes(
-    k: FloatArray, r: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray,
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Modes of all lanes with such rates; `feed` and `shape` have a row for every mode of every cell."""
-    m_all, lanes = len(marks[0]), len(marks[5])
-    for i in range(lanes):
-        for m in range(m_all):
-            norm = 0.0
-            for j in range(m_all + 1):
-                inverse = 1.0 / (r[j * lanes + i] - rates[m, i])
-                norm += k[j * lanes + i] * inverse * inverse
-                shape[(j * m_all + m) * lanes + i] = k[j * lanes + i] * inverse
-                feed[(j * m_all + m) * lanes + i] = inverse
-            gain[m * lanes + i] = -1.0 / norm
-            for j in range(m_all + 1):
-                feed[(j * m_all + m) * lanes + i] *= -1.0 / norm
-
-
 @jit
-def find_modes(rates: FloatArray, scratch: Any, marks: Marks) -> None:
-    """Modes of all lanes: in closed form, and by iteration where this would lose digits or there is none."""
+def _by_iteration(rates: FloatArray, scratch: Any, marks: Marks) -> None:
+    """Modes of the lanes for which the closed form would lose digits, or of all where there is none."""
     k, _, r, near, gain, feed, shape, _, own, found, forms, floats, whole = scratch
     m_all, lanes = len(marks[0]), len(marks[5])
-    if m_all <= 2:
-        _shapes(k, r, rates, gain, feed, shape, marks)
     for i in range(lanes):
         if near[i] > 0.0:
             for j in range(m_all + 1):
@@ -91,25 +75,6 @@ def find_modes(rates: FloatArray, scratch: Any, marks: Marks) -> None:
                 for j in range(m_all + 1):
                     feed[(j * m_all + m) * lanes + i] = forms[0, j, m]
                     shape[(j * m_all + m) * lanes + i] = forms[1, j, m]
-
-
-@jit_rows
-def link(
-    gap: int, leaks: NDArray[np.int64], moved: FloatArray, feed: FloatArray, shape: FloatArray, c: FloatArray,
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Constants by which the modes have to do with gap and leaks."""
-    m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
-    of_z = lockstep.SHAPE + m_all + w_all + l_all * w_all
-    of_leak = of_z + l_all * m_all
-    for i in range(lanes):
-        for m in range(m_all):
-            c[(lockstep.SHAPE + m) * lanes + i] = shape[(gap * m_all + m) * lanes + i]
-            for n in range(l_all):
-                c[(of_z + n * m_all + m) * lanes + i] = shape[(leaks[n] * m_all + m) * lanes + i]
-                c[(of_leak + m * l_all + n) * lanes + i] = (
-                    feed[(leaks[n] * m_all + m) * lanes + i] * moved[leaks[n] * lanes + i]
-                )
 
 
 # A table of scenes has three rows for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
@@ -195,8 +160,15 @@ def _inverse_areas(
 
 
 @jit_rows
-def _polynomials(matrix: FloatArray, values: FloatArray, area: int, c: FloatArray, marks: Marks) -> None:
-    """Coefficients of 1/A of every lane, from row `area` of the constants on, from its values at Chebyshev's points."""
+def _polynomials(
+    matrix: FloatArray, values: FloatArray, top: FloatArray, xi: FloatArray, area: int, c: FloatArray,
+    tails: FloatArray, marks: Marks,
+) -> None:  # fmt: skip
+    """Coefficients of 1/A of every lane, from row `area` of the constants on, from its values at Chebyshev's points.
+
+    With them go the scale of |u|, and behind them the derivative of 1/A by |u| at 0 V, where their variable is -1.
+    `xi` is X at 1 V.
+    """
     count, lanes = len(marks[3]), len(marks[5])
     for d in range(count):
         for i in range(lanes):
@@ -204,110 +176,80 @@ def _polynomials(matrix: FloatArray, values: FloatArray, area: int, c: FloatArra
             for j in range(1, count):
                 total += matrix[d, j] * values[j * lanes + i]
             c[(area + d) * lanes + i] = total
-
-
-@jit_rows
-def _slopes(area: int, c: FloatArray, marks: Marks) -> None:
-    """Derivative of 1/A by |u| at 0 V, where the polynomial's variable is -1, into the row behind the coefficients."""
-    count, lanes = len(marks[3]), len(marks[5])
     for i in range(lanes):
-        total, value = 0.0, c[area * lanes + i]
+        slope, value = 0.0, c[area * lanes + i]
         for d in range(1, count):
-            total = value - total
+            slope = value - slope
             value = c[(area + d) * lanes + i] - value
-        c[(area + count) * lanes + i] = total * c[lockstep.SCALE * lanes + i]
+        c[lockstep.SCALE * lanes + i] = 2.0 / top[i]
+        c[(area + count) * lanes + i] = slope * c[lockstep.SCALE * lanes + i]
+        # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
+        # These fall to about a third from one to the next; the last one alone may be small by chance.
+        tail = max(abs(c[area * lanes + i]), 2.0 / 3.0 * abs(c[(area + 1) * lanes + i])) / 2.0 ** (count - 2)
+        tails[i] = tail / c[(area + count - 1) * lanes + i] if xi[i] * top[i] <= LARGEST_X else math.inf
 
 
 @jit_rows
 def _respond(
-    t: FloatArray, tones: FloatArray, k: FloatArray, gain: FloatArray, rates: FloatArray, start: FloatArray,
-    c: FloatArray, gap: int, leaks: NDArray[np.int64], marks: Marks,
+    t: FloatArray, tones: FloatArray, lines: bool, where: tuple[int, NDArray[np.int64]], rates: FloatArray,
+    k: FloatArray, moved: FloatArray, forms: tuple[FloatArray, FloatArray, FloatArray], start: FloatArray,
+    drive: FloatArray, c: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
-    """Response to the tones, in the constants of the block, and the modes at the start, which are the rest beside it.
+    """How modes and source act on gap and leaks, into the constants, and the modes at the start.
 
-    A tone's response in a mode is gain (rate - i omega) / (rate^2 + omega^2) of it.
+    A tone's response in a mode is gain (rate - i omega) / (rate^2 + omega^2) of it, and the modes are the rest beside
+    it. Constant pieces and straight lines act on the cells at once, and drive the modes.
     """
     m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
+    (gap, leaks), (gain, feed, shape) = where, forms
     others, of_u = CELL_ROWS * (m_all + 1), lockstep.SHAPE + m_all
     of_w = of_u + w_all
     of_z = of_w + l_all * w_all
+    of_leak, driven = of_z + l_all * m_all, 1.0 if lines else 0.0
     for i in range(lanes):
         for m in range(m_all):
             start[m * lanes + i] = 0.0
-        for tone in range(w_all // 2):
+            c[(lockstep.SHAPE + m) * lanes + i] = shape[(gap * m_all + m) * lanes + i]
+            for n in range(l_all):
+                at, to = (leaks[n] * m_all + m) * lanes + i, (of_leak + m * l_all + n) * lanes + i
+                c[(of_z + n * m_all + m) * lanes + i] = shape[at]
+                c[to] = feed[at] * moved[leaks[n] * lanes + i]
+        for tone in range((w_all + 1) // 2):
             row = others + N_OTHERS + 2 * tone
             sine, cosine = t[row * lanes + i], t[(row + 1) * lanes + i]
             omega = tones[tone] * t[(others + OMEGA) * lanes + i]
             u_sine, u_cosine = k[gap * lanes + i] * sine, k[gap * lanes + i] * cosine
             for n in range(l_all):
                 c[(of_w + n * w_all + 2 * tone) * lanes + i] = k[leaks[n] * lanes + i] * sine
-                c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] = k[leaks[n] * lanes + i] * cosine
+                if w_all > 1:
+                    c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] = k[leaks[n] * lanes + i] * cosine
             for m in range(m_all):
                 rate = rates[m, i]
-                size = gain[m * lanes + i] / (rate * rate + omega * omega)
+                drive[m, i] = driven * (gain[m * lanes + i] * sine)
+                size = (1.0 - driven) * gain[m * lanes + i] / (rate * rate + omega * omega)
                 along, across = size * (rate * sine + omega * cosine), size * (rate * cosine - omega * sine)
                 start[m * lanes + i] -= across
                 u_sine += c[(lockstep.SHAPE + m) * lanes + i] * along
                 u_cosine += c[(lockstep.SHAPE + m) * lanes + i] * across
                 for n in range(l_all):
-                    c[(of_w + n * w_all + 2 * tone) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * along
-                    c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * across
+                    by = c[(of_z + n * m_all + m) * lanes + i]
+                    c[(of_w + n * w_all + 2 * tone) * lanes + i] += by * along
+                    if w_all > 1:
+                        c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] += by * across
             c[(of_u + 2 * tone) * lanes + i] = u_sine
-            c[(of_u + 2 * tone + 1) * lanes + i] = u_cosine
+            if w_all > 1:
+                c[(of_u + 2 * tone + 1) * lanes + i] = u_cosine
 
 
-@jit_rows
-def _drive(
-    t: FloatArray, k: FloatArray, gain: FloatArray, start: FloatArray, drive: FloatArray, c: FloatArray, gap: int,
-    leaks: NDArray[np.int64], marks: Marks,
-) -> None:  # fmt: skip
-    """Constants of a source of constant pieces or straight lines: the cells' voltages at once, and the modes' drive."""
-    m_all, l_all, lanes = len(marks[0]), len(marks[2]), len(marks[5])
-    of_u, row = lockstep.SHAPE + m_all, CELL_ROWS * (m_all + 1) + N_OTHERS
-    for i in range(lanes):
-        amplitude = t[row * lanes + i]
-        c[of_u * lanes + i] = k[gap * lanes + i] * amplitude
-        for n in range(l_all):
-            c[(of_u + 1 + n) * lanes + i] = k[leaks[n] * lanes + i] * amplitude
-        for m in range(m_all):
-            start[m * lanes + i] = 0.0
-            drive[m, i] = gain[m * lanes + i] * amplitude
-
-
-@jit
-def put_result(
-    i: int, s: FloatArray, parts: FloatArray, closing: float, lengths: tuple[int, int, int], found: Any, first: int,
-    out: FloatArray, marks: Marks,
-) -> None:  # fmt: skip
-    """Write lane i's column of `out`, which `march.march` describes; `parts` are the sums over parts of the run.
-
-    `lengths` are how often the last part stands for others beside itself; steps of the run; and steps of a part, or of
-    the run, of which each part then has its share.
-    """
-    own, count, lanes = lockstep.N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
-    ahead, steps, of_part = lengths
-    at, peak = first + i, s[(own + lockstep.PEAK) * lanes + i]
-    if at >= out.shape[1]:
-        return
-    for j in range(count):
-        total = s[(own + lockstep.VALUE + count + j) * lanes + i]
-        if ahead > 0:
-            total += ahead * parts[j * lanes + i]
-        out[j, at] = total / steps
-        for k in range(j, out.shape[0] - 3 - count, count):
-            out[count + k, at] = parts[k * lanes + i] / of_part
-    out[-3, at], out[-2, at] = peak, closing
-    out[-1, at] = found[6][i] if peak <= found[5][i] else math.inf
-
-
-def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int, ...], ...], ...]:
+def block_shapes(
+    rows: int, pieces: int, marks: Marks, portions: int = 1
+) -> tuple[tuple[tuple[int, ...], ...], ...]:  # fmt: skip
     """Shapes of a block's arrays, for a table with so many rows and half periods of so many pieces (4 without jumps).
 
     They are in three groups: what `fill_block` finds, its scratch, and what `march.march_block` steps with.
     """
     m, w, k, d, count, lanes = (len(mark) for mark in marks)
     lane, modes, cells, both = (lanes,), (m * lanes,), ((m + 1) * lanes,), ((m + 1) * m * lanes,)
-    weights = lockstep.N_WEIGHTS * m * lanes
     found = (
         ((area_row(m, w, k) + d + 1) * lanes,),  # Constants, as `step` takes them
         modes,  # Modes at the start, V
@@ -324,9 +266,9 @@ def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int,
         cells, cells, cells, lane, modes, both, both, (d * lanes,), (2, m + 1), (2, m), (2, m + 1, m), (2, m + 1),
     )  # fmt: skip
     stepping = (
-        (weights,), (pieces, weights),  # Weights, as `step.run` takes them
+        (1 + pieces, lockstep.N_WEIGHTS * m * lanes),  # Weights, as `step.run` takes them
         (n_state(m, k, count) * lanes,),  # State
-        (count * lanes,),  # Sums over the last period
+        (portions * count * lanes,),  # Sums over the last period, or each portion of a recording
         modes,  # Modes at the start of the last period
         # In the search for the periodic state, the derivative of the start by what a period leaves open, with the area
         # held. In a run from rest, an upper bound of the modes' time constants, in periods.
@@ -336,14 +278,14 @@ def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int,
         lane,
         # Length of the shortest step, s; in a run from rest, then the number of half periods after which it has settled
         lane,
-        (9, lanes),  # Scratch of `step.weigh`
+        (9, lanes),  # Scratch of `step.weigh` and `step.run`
     )  # fmt: skip
     return found, scratch, stepping
 
 
-def new_block(rows: int, pieces: int, marks: Marks) -> tuple[Any, Any, Any]:
+def new_block(rows: int, pieces: int, marks: Marks, portions: int) -> tuple[Any, Any, Any]:
     """Arrays for blocks of scenes; `pieces` is 0 without jumps."""
-    shapes = block_shapes(rows, pieces or 4, marks)
+    shapes = block_shapes(rows, pieces or 4, marks, portions)
     arrays = iter(aligned(shape for group in shapes for shape in group))
     found, scratch, stepping = (tuple(islice(arrays, len(group))) for group in shapes)
     return found, (*scratch, np.empty((2, len(marks[0]) + 1), np.int64)), stepping
@@ -360,7 +302,7 @@ def fill_block(
     """
     m_all, w_all, l_all, d_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[5])
     area = area_row(m_all, w_all, l_all)
-    table, pending, (gap, leaks), curves = scenes
+    table, pending, (gap, _), curves = scenes
     c, start, rates, drive, t, top, tails = found
     k, moved, r, near, gain, feed, shape, values, _, _, _, _, _ = scratch
     for i in range(lanes):
@@ -371,20 +313,9 @@ def fill_block(
     b = t[CELL_ROWS * (m_all + 1) * lanes :]
     for j in range(d_all + 1):
         _inverse_areas(curves[1][j], top, b, curves[0], near, values[j * lanes : (j + 1) * lanes], marks)
-    _polynomials(curves[2], values, area, c, marks)
-    for i in range(lanes):
-        c[lockstep.SCALE * lanes + i] = 2.0 / top[i]
-        # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
-        # These fall to about a third from one to the next; the last one alone may be small by chance.
-        tail = max(abs(c[area * lanes + i]), 2.0 / 3.0 * abs(c[(area + 1) * lanes + i])) / 2.0 ** (d_all - 1)
-        covered = b[XI * lanes + i] * top[i] <= LARGEST_X
-        tails[i] = tail / c[(area + d_all) * lanes + i] if covered else math.inf
-    _slopes(area, c, marks)
-    find_rates(k, moved, r, c[(area + d_all) * lanes : (area + d_all + 1) * lanes], rates, near, marks)
-    find_modes(rates, scratch, marks)
-    link(gap, leaks, moved, feed, shape, c, marks)
-    if source[1]:
-        _drive(t, k, gain, start, drive, c, gap, leaks, marks)
-    else:
-        drive[:] = 0.0
-        _respond(t, source[0], k, gain, rates, start, c, gap, leaks, marks)
+    _polynomials(curves[2], values, top, b[XI * lanes :], area, c, tails, marks)
+    at_rest = c[(area + d_all) * lanes : (area + d_all + 1) * lanes]
+    _in_closed_form(k, moved, r, at_rest, rates, near, gain, feed, shape, marks)
+    _by_iteration(rates, scratch, marks)
+    forms = gain, feed, shape
+    _respond(t, source[0], source[1], scenes[2], rates, k, moved, forms, start, drive, c, marks)

@@ -17,9 +17,6 @@ block is one scene, in a thread of its own (`engine.lockstep.card`).
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within_rows
 from fingerspice.numerics.linear import moments as integrals
@@ -38,9 +35,6 @@ Mark = tuple[tuple[()], ...]
 """A tuple of which only the length counts, which compiled code knows as a constant; it is passed without any cost."""
 Marks = tuple[Mark, Mark, Mark, Mark, Mark, Mark]
 """Marks for the modes, waves, leaks, powers of the polynomial, moments and lanes."""
-
-Weights = tuple[FloatArray, NDArray[np.float64]]
-"""Weights of a step of length 0; and of the steps of every piece of a window, each twice as long, (pieces, n)."""
 
 # Rows of the constants: the scale of |u| to [-1, 1]; u by modes, and by waves; the voltages of the leaks by waves, and
 # by modes, leak after leak; n by leaks, mode after mode; the polynomial of 1/A; and its derivative by |u| at 0 V.
@@ -132,18 +126,18 @@ def _weigh_rows(
 
 @jit
 def weigh(
-    shortest: FloatArray, rates: FloatArray, drive: FloatArray, g: Weights, scratch: FloatArray, marks: Marks
+    shortest: FloatArray, rates: FloatArray, drive: FloatArray, g: FloatArray, scratch: FloatArray, marks: Marks
 ) -> None:  # fmt: skip
-    """Weights of every lane for a step of length 0 and for the pieces, the first of steps of length `shortest` (s).
+    """Weights of every lane, (1 + pieces, n): for a step of length 0 and for the pieces, each twice as long.
 
-    `rates` and `drive` have shape (n_mode, lanes); `scratch` (9, lanes) is overwritten.
+    Steps of the first piece have the length `shortest` (s). `rates` and `drive` have shape (n_mode, lanes); `scratch`
+    (9, lanes) is overwritten.
     """
     m_all, lanes = len(marks[0]), len(marks[5])
-    still, moving = g
+    still, h = g[0], scratch[8]
     still[:] = 0.0
     still[HALF * m_all * lanes : (HALF + 1) * m_all * lanes] = 1.0
     still[DECAY * m_all * lanes : (DECAY + 1) * m_all * lanes] = 1.0
-    h = scratch[8]
     for m in range(m_all):
         half, whole = scratch[:4], scratch[4:8]
         for i in range(lanes):
@@ -157,9 +151,9 @@ def weigh(
             if y > _MOST:
                 integrals(y, half[1:, i])
                 half[0, i] = 1.0 - y * half[1, i]
-        for piece in range(moving.shape[0]):
+        for piece in range(1, g.shape[0]):
             _double(half, whole, marks)
-            _weigh_rows(h, drive[m], half, whole, moving[piece], m, marks)
+            _weigh_rows(h, drive[m], half, whole, g[piece], m, marks)
             half, whole = whole, half
             for i in range(lanes):
                 h[i] *= 2.0
@@ -180,22 +174,22 @@ def _change(c: FloatArray, u: float, area: int, powers: Mark, lanes: int, i: int
 
 
 @jit_within_rows
-def _by_waves(c: FloatArray, row: int, source: FloatArray, waves: Mark, lanes: int, i: int) -> float:
-    total = c[row * lanes + i] * source[0]
+def _by_waves(c: FloatArray, row: int, wave: FloatArray, at: int, waves: Mark, lanes: int, i: int) -> float:
+    total = c[row * lanes + i] * wave[at, 0]
     for w in range(1, len(waves)):
-        total += c[(row + w) * lanes + i] * source[w]
+        total += c[(row + w) * lanes + i] * wave[at, w]
     return float(total)
 
 
 @jit_rows
 def step(
-    c: FloatArray, g: FloatArray, s: FloatArray, source: tuple[FloatArray, FloatArray, FloatArray], trend: float,
+    c: FloatArray, g: FloatArray, s: FloatArray, wave: FloatArray, rows: tuple[int, int, int], trend: float,
     weight: float, marks: Marks,
 ) -> None:  # fmt: skip
     """One step of every lane; adds `weight` times Simpson's sums of the integrands over it to their sums.
 
-    `source` holds the waves at the start, in the middle and at the end of the step; `trend` is the length of the step
-    over that of the one before, 0 for a step that has none before it.
+    `rows` of `wave` hold the waves at the start, in the middle and at the end of the step; `trend` is the length of the
+    step over that of the one before, 0 for a step that has none before it.
     """
     modes, waves, leaks, powers, moments, scenes = marks
     m_all, w_all, l_all, count, lanes = len(modes), len(waves), len(leaks), len(moments), len(scenes)
@@ -208,10 +202,10 @@ def step(
     own = N_STATE * m_all
     value, total = own + VALUE, own + VALUE + count
     current = total + count
-    start, middle, end = source
-    first, last, share = start[0], end[0], trend / (1.0 + trend)
+    begin, middle, end = rows
+    first, last, share = wave[begin, 0], wave[end, 0], trend / (1.0 + trend)
     for i in range(lanes):
-        u = _by_waves(c, of_u, middle, waves, lanes, i)
+        u = _by_waves(c, of_u, wave, middle, waves, lanes, i)
         for m in range(m_all):
             now, between = s[(RATE * m_all + m) * lanes + i], s[(MIDDLE * m_all + m) * lanes + i]
             curve = trend * ((now - between) - (between - s[(OLD * m_all + m) * lanes + i]))
@@ -226,15 +220,15 @@ def step(
             u += c[(SHAPE + m) * lanes + i] * guess
         q = _change(c, u, area, powers, lanes, i)
         for k in range(l_all):
-            change = _by_waves(c, of_w + k * w_all, middle, waves, lanes, i)
+            change = _by_waves(c, of_w + k * w_all, wave, middle, waves, lanes, i)
             for m in range(m_all):
                 change += c[(of_z + k * m_all + m) * lanes + i] * s[(GUESS * m_all + m) * lanes + i]
             s[(current + k) * lanes + i] = q * change
             s[(current + l_all + k) * lanes + i] = change
         square = u * u
         force = square / (q + c[rest * lanes + i])
-        wave = _by_waves(c, of_u, end, waves, lanes, i)
-        u = wave
+        at_end = _by_waves(c, of_u, wave, end, waves, lanes, i)
+        u = at_end
         for m in range(m_all):
             rate = c[(of_leak + m * l_all) * lanes + i] * s[current * lanes + i]
             for k in range(1, l_all):
@@ -259,12 +253,12 @@ def step(
         missed = (before * before + u * u) / (2.0 * size + 1e-300) - (size + 2.0 * abs(before + u)) / 6.0
         missed = c[slope * lanes + i] * missed if before * u < 0.0 else 0.0
         for k in range(l_all):
-            change = _by_waves(c, of_w + k * w_all, end, waves, lanes, i)
+            change = _by_waves(c, of_w + k * w_all, wave, end, waves, lanes, i)
             for m in range(m_all):
                 change += c[(of_z + k * m_all + m) * lanes + i] * s[(GUESS * m_all + m) * lanes + i]
             s[(current + k) * lanes + i] = q * change
             s[(current + l_all + k) * lanes + i] *= missed
-        u = wave
+        u = at_end
         for m in range(m_all):
             rate = c[(of_leak + m * l_all) * lanes + i] * s[current * lanes + i]
             kink = c[(of_leak + m * l_all) * lanes + i] * s[(current + l_all) * lanes + i]
@@ -294,46 +288,45 @@ def step(
 
 
 @jit
-def _record(s: FloatArray, trace: FloatArray, at: int, marks: Marks) -> None:
-    """Write the gap voltages of the state into column `at` of the trace, shape (lanes, n)."""
-    if trace.size > 0:
-        lanes = len(marks[5])
-        gap, stride = (N_STATE * len(marks[0]) + GAP) * lanes, trace.size // lanes
-        for i in range(lanes):
-            trace[i * stride + at] = s[gap + i]
-
-
-@jit
 def run(
-    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, how: tuple[int, int, int, bool], trace: FloatArray,
-    marks: Marks,
+    c: FloatArray, g: FloatArray, s: FloatArray, wave: FloatArray, how: tuple[int, int, int, int, bool],
+    line: FloatArray, trace: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
-    """Integrate a block's scenes over some half periods, from the state `s` on: at the start modes, and 0 for the rest.
+    """Integrate a block's scenes over some steps, from the state `s` on: at the start modes, and 0 for the rest.
 
     `wave` (2 n + 9, len(waves)) has the waves at ends and middles of the n steps of a period, and at `START_TIMES`; of
-    a turned source (2, 1) its values in both halves of a period. `how` is the number of half periods that lie behind, 0
-    at the start of a run; and of those when this ends; number of steps in each; and whether the source is turned: it is
-    constant for a half period, then jumps to its negative, and the method restarts. Such a half period has the pieces
-    that `g` has: of equally many steps, which are twice as long in every piece as in the one before. The `trace`
-    (lanes * steps,) or (0,) takes the gap voltage before each step of the run, V.
+    a turned source (2, 1) its values in both halves of a period; of a recording (n, 1) its samples, with straight lines
+    between them, for which the rows of `line` are overwritten. `how` is the number of steps that lie behind, 0 at the
+    start of a run; and of those when this ends; number of steps in each half period, or between two samples; number of
+    pieces, 0 for waves; and whether the source is recorded. A turned source is constant for a half period, then jumps
+    to its negative, and the method restarts. Such a half period has the pieces that `g` has: of equally many steps,
+    which are twice as long in every piece as in the one before; between two samples there is one. The `trace`
+    (n, steps) takes the gap voltage of the first n lanes before each step of the run, V; (n, 0) for none.
     """
-    done, halves, half, turned = how
-    pieces, period, stride = g[1].shape[0], wave.shape[0] - len(START_TIMES), 0 if turned else 1
-    shortest, before = pieces / (2.0**pieces - 1.0) if turned else 0.125, START
-    for k in range(done * half, halves * half):
-        starts, piece, parts = k == 0 or (turned and k % half == 0), k % half * pieces // half if turned else START, 1
-        if k == 0 and not turned:
-            parts = len(START_STEPS)
+    done, upto, half, pieces, recorded = how
+    period, turned, source = wave.shape[0] - len(START_TIMES), pieces > 0 and not recorded, line if recorded else wave
+    shortest, before = (pieces / (2.0**pieces - 1.0), 0) if pieces > 0 else (0.125, START)
+    for k in range(done, upto):
+        starts, piece = k == 0 or (turned and k % half == 0), k % half * pieces // half if pieces > 0 else START
+        parts = len(START_STEPS) if k == 0 and pieces == 0 else 1
         # A step of length 0 evaluates the nonlinear term and the integrands.
         for part in range(-1 if starts else 0, parts):
-            if part == 0:
-                _record(s, trace, k, marks)
+            for i in range(min(trace.shape[0], len(marks[5])) if part == 0 and trace.size > 0 else 0):
+                trace[i, k] = s[(N_STATE * len(marks[0]) + GAP) * len(marks[5]) + i]
             if parts > 1:
                 piece = START_STEPS[max(part, 0)]
-            at = k // half % 2 if turned else (period + 2 * max(part, 0) if k == 0 else 2 * k % period)
-            between, end = (at, at) if part < 0 else (at + stride, at + 2 * stride)
+            if recorded:
+                rows, here = (0, 1, 2), wave[k // half, 0]
+                change = (wave[k // half + 1, 0] - here) / half
+                for i in range(3):
+                    line[i, 0] = here + (k % half + (0.5 * i if part >= 0 else 0.0)) * change
+            elif turned:
+                at = k // half % 2
+                rows = at, at, at
+            else:
+                at = period + 2 * max(part, 0) if k == 0 else 2 * k % period
+                rows = (at, at, at) if part < 0 else (at, at + 1, at + 2 if at + 2 != period else 0)
             trend = 0.0 if part < 0 or (part == 0 and starts) else 2.0 ** (piece - before)
             weight = 0.0 if part < 0 else shortest * 2.0**piece / 6.0
-            rows = wave[at], wave[between], wave[end if end != period else 0]
-            step(c, g[0] if part < 0 else g[1][piece], s, rows, trend, weight, marks)
+            step(c, g[0 if part < 0 else 1 + piece], s, source, rows, trend, weight, marks)
             before = piece

@@ -16,7 +16,7 @@ from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import Value
 from fingerspice.circuit.statespace import Stack, build_stack, loop_of
 from fingerspice.engine.lockstep.card import march_on_card
-from fingerspice.engine.lockstep.march import N_PORTION, march, march_samples
+from fingerspice.engine.lockstep.march import N_PORTION, march
 from fingerspice.engine.lockstep.scenes import CELL_ROWS, LARGEST_X, LOAD, LOSS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep.step import ALL_MOMENTS, START_TIMES, marks_of
 from fingerspice.numerics import chebyshev
@@ -292,8 +292,8 @@ class Ladder:
         rates = leaks / (table[:cells] * table[others + OMEGA])
         # Smallest leakage rate, in periods over 2 pi; and half a period in time constants of the fastest cell
         self.slowest, self.decays = rates.min(axis=0), np.max(rates, axis=0) * np.pi
-        # Pieces of a half period, each twice as long as the one before; 0 for a source that is no square
-        self.pieces = np.zeros(table.shape[1], int)
+        # Pieces of a half period, each twice as long as the one before; 0 for tones
+        self.pieces = np.full(table.shape[1], int(form.recording is not None))
         first: FloatArray | float = 0.0
         if form.jumping:
             # Gap voltages at equal distances need a single piece.
@@ -375,8 +375,8 @@ class Ladder:
         curves = curves_of(form.gap.values["m_exp"], form.gap.values["n_exp"], degree)
         if curves is None:
             return None
-        sizes = steps // 2 if before is None else 0, steps
-        waves = _waves(sizes[0], form), _waves(sizes[1], form)
+        sizes, recorded = (steps // 2 if before is None else 0, steps), form.recording is not None
+        waves = _waves(sizes[0], form, halves), _waves(sizes[1], form, halves)
         coarse, fine = (np.empty((columns.size, halves * n // 2 if task.traced else 0)) for n in sizes)
         # Index of the gap among the cells, and those of the cells whose leak has a total resistance
         assert form.stack.gap is not None
@@ -384,21 +384,15 @@ class Ladder:
         leaks: IntArray = np.array([i for i, device in enumerate(devices) if device in ("LAYER", "GAP")])
         lengths = form.stack.c.size - 1, waves[1].shape[1], leaks.size, degree + 1, self.n_moment
         marks, scenes = marks_of(*lengths), (self.table, columns, (form.stack.gap, leaks), curves)
-        pieces = int(self.pieces[pending[0]])
-        block = new_block(self.table.shape[0], pieces, marks)
-        if form.recording is not None:
-            out = np.empty((2, (1 + N_PORTION) * self.n_moment + 3, columns.size))
-            values = form.recording.between(0, halves + 1) / peak_of(form.recording)
-            march_samples(scenes, values, (sizes, covered), block, out, marks)
+        pieces, source = int(self.pieces[pending[0]]), (np.array(form.multiples, float), waves, recorded)
+        tol = (_CLOSING if task.periodic else _SETTLED) * (task.rtol * self.closer)
+        how = halves, steps if recorded else steps // 2, pieces, task.periodic, tol, covered
+        if task.device == "cuda" and not recorded:
+            out = march_on_card(scenes, source, how, _MOST_PIECES if form.jumping else 0, lengths)
         else:
-            source = np.array(form.multiples, float), waves
-            tol = (_CLOSING if task.periodic else _SETTLED) * (task.rtol * self.closer)
-            how = halves, steps // 2, pieces, task.periodic, tol, covered
-            if task.device == "cuda":
-                out = march_on_card(scenes, source, how, _MOST_PIECES if form.jumping else 0, lengths)
-            else:
-                out = np.empty((2, 2 * self.n_moment + 3, columns.size))
-                march(scenes, source, how, block, out, (coarse, fine), marks)
+            out = np.empty((2, (1 + (N_PORTION if recorded else 1)) * self.n_moment + 3, columns.size))
+            block = new_block(self.table.shape[0], pieces, marks, N_PORTION if recorded else 1)
+            march(scenes, source, how, block, out, (coarse, fine), marks)
         halved = (out[0], coarse) if before is None else (before.fine, before.trace)
         return Run(steps, degree, out[1], fine, *halved)
 
@@ -519,10 +513,10 @@ class Slopes(Ladder):
         return change, change / np.where(size > 0.0, size, 1.0)
 
 
-def _waves(n: int, form: LockstepForm) -> FloatArray:
-    """Sine and cosine of every tone at the times that `step.run` needs; a square's value in both halves."""
+def _waves(n: int, form: LockstepForm, halves: int) -> FloatArray:
+    """Sine and cosine of every tone at the times that `step.run` needs; a square's value in both halves; or samples."""
     if form.recording is not None:
-        return np.empty((0, 1))
+        return (form.recording.between(0, halves + 1) / peak_of(form.recording))[: n * (halves + 1), None]
     if n == 0 or form.jumping:
         return np.array([[1.0], [-1.0]])[: 2 * n]
     # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
