@@ -378,12 +378,12 @@ class Ladder:
         sizes, recorded = (steps // 2 if before is None else 0, steps), form.recording is not None
         waves = _waves(sizes[0], form, halves), _waves(sizes[1], form, halves)
         coarse, fine = (np.empty((columns.size, halves * n // 2 if task.traced else 0)) for n in sizes)
-        # Index of the gap among the cells, and those of the cells whose leak has a total resistance
-        assert form.stack.gap is not None
-        devices = [form.stack.layers[i].device for i in form.stack.layer_of]
-        leaks: IntArray = np.array([i for i, device in enumerate(devices) if device in ("LAYER", "GAP")])
-        lengths = form.stack.c.size - 1, waves[1].shape[1], leaks.size, degree + 1, self.n_moment
-        marks, scenes = marks_of(*lengths), (self.table, columns, (form.stack.gap, leaks), curves)
+        # The cells whose leak has a total resistance, and in any case the gap
+        n, gap = form.stack.c.size, form.stack.gap
+        assert gap is not None
+        leaks: IntArray = np.flatnonzero(self.table[n : 2 * n].any(axis=1) | (np.arange(n) == gap))
+        lengths = n - 1, waves[1].shape[1], leaks.size, degree + 1, self.n_moment
+        marks, scenes = marks_of(*lengths), (self.table, columns, (gap, leaks), curves)
         pieces, source = int(self.pieces[pending[0]]), (np.array(form.multiples, float), waves, recorded)
         tol = (_CLOSING if task.periodic else _SETTLED) * (task.rtol * self.closer)
         how = halves, steps if recorded else steps // 2, pieces, task.periodic, tol, covered
