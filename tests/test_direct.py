@@ -53,17 +53,13 @@ def test_a_sine_settles_at_equation_11(f: float, first: int) -> None:
     t = (first + np.linspace(0.0, 1.0, 41)) / f
     solution = linear(f"SIN(0 200 {f!r})", t, (first + 1.0) / f, f)
     expected = ref.periodic_sine_frozen(f, 200.0, AREA).u(within_a_period(t, f))
-    assert np.abs(solution.u_layer - expected).max() <= (1e-12 + rounded_phase(t, f)) * 200.0
+    rounded_phase = float(2.0 * math.pi * np.spacing(f * t.max()))
+    assert np.abs(solution.u_layer - expected).max() <= (1e-12 + rounded_phase) * 200.0
 
 
 def within_a_period(t: np.ndarray, f: float) -> np.ndarray:
     """Times since the last whole period, without the rounding of a long phase."""
     return np.array([float((Fraction(float(x)) * Fraction(f)) % 1) / f for x in t])
-
-
-def rounded_phase(t: np.ndarray, f: float) -> float:
-    """Radians that one rounding of the phase f t is worth."""
-    return float(2.0 * math.pi * np.spacing(f * t.max()))
 
 
 @every_law

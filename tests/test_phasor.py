@@ -112,14 +112,11 @@ def test_the_reading_of_equation_7_reaches_the_coupled_area() -> None:
 @given(amplitude=st.floats(0.0, 1e4), steepness=st.floats(-0.9, 3.0), reach=st.floats(1.0, 1e3))
 @example(amplitude=2.0, steepness=2.0, reach=1.0)  # Iterating on the area swings between two values.
 def test_the_coupled_area_solves_its_equation_for_any_monotone_area_and_gain(amplitude, steepness, reach):
-    def area_of(u: float) -> float:
-        return 1.0 / (1.0 + (u / reach) ** 2)
+    def area_at(a: float) -> float:
+        return 1.0 / (1.0 + (amplitude * (0.2 + 0.7 * a ** (1.0 + steepness)) / math.sqrt(2.0) / reach) ** 2)
 
-    def gain_of(area: float) -> float:
-        return 0.2 + 0.7 * area ** (1.0 + steepness)
-
-    (a,) = settled_areas(lambda a: np.array([area_of(amplitude * gain_of(a[0]) / math.sqrt(2.0))]), np.ones(1))
-    assert area_of(amplitude * gain_of(a) / math.sqrt(2.0)) == pytest.approx(a, rel=1e-12)
+    (a,) = settled_areas(lambda a: np.array([area_at(a[0])]), np.ones(1))
+    assert area_at(a) == pytest.approx(a, rel=1e-12)
 
 
 # Areas and sources ------------------------------------------------------------------------------------------
