@@ -59,8 +59,8 @@ def _off(i: int, c: FloatArray, stepping: Any, steps: int, periodic: bool, trace
 
 @jit
 def _integrate(
-    found: Any, stepping: Any, wave: FloatArray, how: tuple[int, int, int, bool, bool, float], trace: FloatArray,
-    out: FloatArray, first: int, marks: Marks,
+    found: Any, stepping: Any, wave: FloatArray, samples: FloatArray, how: tuple[int, int, int, bool, bool, float],
+    trace: FloatArray, out: FloatArray, first: int, marks: Marks,
 ) -> None:  # fmt: skip
     """Run a block's scenes range by range, with weights that are known, and write their columns of `out`.
 
@@ -68,12 +68,11 @@ def _integrate(
     back to it; a lane that does so keeps its start. A run from rest has periods, of which the first may be half a one;
     a scene that has settled takes part in further ones only if others of its block do, and its results stay those at
     which it settled: no result depends on the scenes beside it. A recording has portions, whose sums are all kept.
-    `how` is as `How`, but for steps in the run's half periods, and with whether the source is recorded in front of the
-    tolerance.
+    `how` is as `How`, but for steps in the run's half periods, and whether the source is recorded before the tolerance.
     """
     halves, steps, pieces, periodic, recorded, tol = how
     c, start, _, _, _, covered, tails = found
-    g, s, last, before, back, closing, settled, line = stepping
+    g, s, last, before, back, closing, settled, _ = stepping
     m_all, count, lanes = len(marks[0]), len(marks[4]), len(marks[5])
     own, size, ends = lockstep.N_STATE * m_all, count * lanes, N_PORTION if recorded else halves
     sums, of_part = (own + lockstep.VALUE) * lanes + size, (halves if recorded else 2) * steps
@@ -91,7 +90,7 @@ def _integrate(
         for i in range(size):
             last[place + i] = math.nan if half_of_period and not recorded else -s[sums + i]
         way = (done * halves // ends * steps, upto * halves // ends * steps, steps, pieces, recorded)
-        run(c, g, s, wave, way, line, trace, marks)
+        run(c, g, s, wave, way, samples, trace, marks)
         for i in range(size):
             last[place + i] += s[sums + i]
         done, turns, again = upto, turns + 1, False
@@ -148,17 +147,16 @@ def march_block(
                 back[m * lanes + i] = -1.0 / math.expm1(-rates[m, i] * period)
             else:
                 back[m * lanes + i] = 1.0 / (SLOWER * rates[m, i] * period + 1e-300)
-    for w in range(2):
-        wave, steps = source[1][w], half // 2 if w == 0 else half
-        if wave.size == 0:
-            continue
+    for w in range(1 if source[1][0].size == 0 else 0, 2):
+        given, steps = source[1][w], half // 2 if w == 0 else half
         # All pieces together are 2^pieces - 1 times the first, which has steps / pieces of the shortest steps.
         shorter = pieces / (2.0**pieces - 1.0) if lines else lockstep.START_TIMES[2]
         for i in range(lanes):
             length[i] = math.pi / t[omega + i] / steps * shorter
         weigh(length, rates, drive, g[: 1 + (pieces or 4)], moments, marks)
         way = (halves, steps, pieces, periodic, source[2], tol)
-        _integrate(found, stepping, wave, way, traces[w][first:], out[w], first, marks)
+        wave = moments if source[2] else given  # Of a recording, rows that are written on the way
+        _integrate(found, stepping, wave, given, way, traces[w][first:], out[w], first, marks)
 
 
 @jit

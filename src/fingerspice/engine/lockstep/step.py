@@ -290,21 +290,21 @@ def step(
 @jit
 def run(
     c: FloatArray, g: FloatArray, s: FloatArray, wave: FloatArray, how: tuple[int, int, int, int, bool],
-    line: FloatArray, trace: FloatArray, marks: Marks,
+    samples: FloatArray, trace: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
     """Integrate a block's scenes over some steps, from the state `s` on: at the start modes, and 0 for the rest.
 
     `wave` (2 n + 9, len(waves)) has the waves at ends and middles of the n steps of a period, and at `START_TIMES`; of
-    a turned source (2, 1) its values in both halves of a period; of a recording (n, 1) its samples, with straight lines
-    between them, for which the rows of `line` are overwritten. `how` is the number of steps that lie behind, 0 at the
-    start of a run; and of those when this ends; number of steps in each half period, or between two samples; number of
-    pieces, 0 for waves; and whether the source is recorded. A turned source is constant for a half period, then jumps
-    to its negative, and the method restarts. Such a half period has the pieces that `g` has: of equally many steps,
-    which are twice as long in every piece as in the one before; between two samples there is one. The `trace`
-    (n, steps) takes the gap voltage of the first n lanes before each step of the run, V; (n, 0) for none.
+    a turned source (2, 1) its values in both halves of a period. Of a recording, `samples` (n, 1) are joined by lines,
+    which three rows of `wave` take on the way. `how` is the number of steps that lie behind, 0 at the start of a run;
+    and of those when this ends; number of steps in each half period, or between two samples; number of pieces, 0 for
+    waves; and whether the source is recorded. A turned source is constant for a half period, then jumps to its
+    negative, and the method restarts. Such a half period has the pieces that `g` has: of equally many steps, which are
+    twice as long in every piece as in the one before; between two samples there is one. The `trace` (n, steps) takes
+    the gap voltage of the first n lanes before each step of the run, V; (n, 0) for none.
     """
     done, upto, half, pieces, recorded = how
-    period, turned, source = wave.shape[0] - len(START_TIMES), pieces > 0 and not recorded, line if recorded else wave
+    period, turned = wave.shape[0] - len(START_TIMES), pieces > 0 and not recorded
     shortest, before = (pieces / (2.0**pieces - 1.0), 0) if pieces > 0 else (0.125, START)
     for k in range(done, upto):
         starts, piece = k == 0 or (turned and k % half == 0), k % half * pieces // half if pieces > 0 else START
@@ -316,10 +316,10 @@ def run(
             if parts > 1:
                 piece = START_STEPS[max(part, 0)]
             if recorded:
-                rows, here = (0, 1, 2), wave[k // half, 0]
-                change = (wave[k // half + 1, 0] - here) / half
+                rows, here = (0, 1, 2), samples[k // half, 0]
+                change = (samples[k // half + 1, 0] - here) / half
                 for i in range(3):
-                    line[i, 0] = here + (k % half + (0.5 * i if part >= 0 else 0.0)) * change
+                    wave[i, 0] = here + (k % half + (0.5 * i if part >= 0 else 0.0)) * change
             elif turned:
                 at = k // half % 2
                 rows = at, at, at
@@ -328,5 +328,5 @@ def run(
                 rows = (at, at, at) if part < 0 else (at, at + 1, at + 2 if at + 2 != period else 0)
             trend = 0.0 if part < 0 or (part == 0 and starts) else 2.0 ** (piece - before)
             weight = 0.0 if part < 0 else shortest * 2.0**piece / 6.0
-            step(c, g[0 if part < 0 else 1 + piece], s, source, rows, trend, weight, marks)
+            step(c, g[0 if part < 0 else 1 + piece], s, wave, rows, trend, weight, marks)
             before = piece
