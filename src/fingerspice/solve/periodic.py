@@ -89,9 +89,8 @@ class Period:
         self.kept = np.where(self.neutral[:n], kept, 0.0)
         pushed = np.any(self.modes.gains[self.neutral[:n]] != 0.0)
         # The integrated span is one of so many parts of the period; its length, s.
-        self.parts = (
-            2 if _turns(problem.network.waveforms, waveform.period) and not pushed and not np.any(self.kept) else 1
-        )
+        turns = not pushed and not np.any(self.kept) and _turns(problem.network.waveforms, waveform.period)
+        self.parts = 2 if turns else 1
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
         key = "period", self.begin, self.span, problem.step if waveform.is_sampled else 0.0

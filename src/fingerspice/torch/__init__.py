@@ -212,13 +212,15 @@ class _DriveRun(torch.autograd.Function):
         return torch.from_numpy(np.stack(rows)).reshape(*samples.shape[:-1], -1)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
+    def _backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
         """Derivatives by the samples, from one way back through every run."""
         rows = []
         for run, row in zip(ctx.runs, by_output.reshape(len(ctx.runs), -1), strict=True):
             rows.append(run.sample_gradient(**{k: x.numpy() for k, x in ctx.drive.by_name(row).items()}).values)
         return None, torch.from_numpy(np.stack(rows)).reshape(ctx.shape)
+
+    # Not a decorator: without torch, types are not known.
+    backward: Any = staticmethod(torch.autograd.function.once_differentiable(_backward))
 
 
 class Simulator(Runs):
