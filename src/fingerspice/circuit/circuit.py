@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -73,8 +74,8 @@ class Element(Remembering):
         """The device's entry in the registry."""
         return DEVICES[self.device]
 
-    @property
-    def parameters(self) -> dict[str, Parameter]:
+    @cached_property
+    def parameters(self) -> Mapping[str, Parameter]:
         """Every number of the device and of its waveform by name, with its unit."""
         found = {p.name: Parameter(self.values[p.name], p.unit) for p in self.spec.parameters}
         wave, units = self.waveform, {} if self.waveform is None else type(self.waveform).units

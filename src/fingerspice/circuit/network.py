@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import count, pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -316,7 +316,7 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
         stack = build_stack(circuit, skin_at)
         network = shared(circuit, ("loop network", skin_at), lambda: loop_network(stack))
-        return replace(network, sources=(replace(network.sources[0], waveform=stack.waveform),), stack=stack)
+        return network if network.stack is stack else replace(network, sources=(replace(network.sources[0], waveform=stack.waveform),), stack=stack)
 
     return circuit.remember(("network", skin_at), make)
 
@@ -329,25 +329,37 @@ def checked(circuit: Circuit) -> Circuit:
     return circuit
 
 
+@lru_cache(maxsize=64)
+def _loop_voltages(
+    hops: tuple[tuple[bool, float], ...], of_layer: tuple[int, ...], sign: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`Network.p`, `q` and `nodes` of a loop: of each hop whether it is a source, and its sign; of each cell likewise.
+
+    Cell voltages follow from the states and the loop's voltage, node voltages also from each of several sources.
+    """
+    n, sources = len(sign) - 1, sum(is_source for is_source, _ in hops)
+    several = sources if sources > 1 else 0
+    across = np.zeros((n + 1, n + 1 + several))
+    across[:n, :n] = np.eye(n)
+    across[n, :n], across[n, n] = -sign[n] * np.array(sign[:n]), sign[n]
+    layer, source, one, cells = count(), count(n + (several > 0)), np.eye(across.shape[1]), np.array(of_layer)
+    drops = [
+        turn * (one[next(source)] if is_source else across[cells == next(layer)].sum(axis=0))
+        for is_source, turn in hops[:-1]
+    ]
+    return across[:, :n].copy(), across[:, n : n + 1].copy(), 0.0 - np.cumsum(drops, axis=0)
+
+
 def loop_network(stack: Stack) -> Network:
     """The network of a stack, its cells in the order of `Stack.state_order`, with voltages from p to n."""
     order, n = list(stack.state_order), stack.c.size - 1
-    of_layer, sign = stack.layer_of[order], stack.sign[order]
+    of_layer, sign = stack.layer_of[order].tolist(), stack.sign[order]
     constants = np.stack([stack.c, stack.g_total, stack.g_area], axis=1)[order].tolist()
     area = stack.area_given if stack.contact is None or stack.area_given else stack.contact.area_at_rest
     assert area is not None
     # The delivered charge is computed at the cell that leaks most slowly, where cancellation costs fewest digits.
     slowest = np.array(order) == np.argmin(stack.leak_rates(area))
-    # Cell voltages follow from the states and the loop's voltage, node voltages also from each of several sources.
-    several = len(stack.sources) if len(stack.sources) > 1 else 0
-    across = np.zeros((n + 1, n + 1 + several))
-    across[:n, :n] = np.eye(n)
-    across[n, :n], across[n, n] = -sign[n] * sign[:n], sign[n]
-    layer, source, one = count(), count(n + (several > 0)), np.eye(across.shape[1])
-    drops = [
-        hop.sign * (one[next(source)] if hop.element.device == "V" else across[of_layer == next(layer)].sum(axis=0))
-        for hop in stack.hops[:-1]
-    ]
+    p, q, nodes = _loop_voltages(tuple((h.element.device == "V", h.sign) for h in stack.hops), (*of_layer,), (*sign,))
     gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
     cells = [Cell(stack.layers[i], ("1", "0"), 0, *own) for i, own in zip(of_layer, constants, strict=True)]
     around = Element("loop", "V", ("1", "0"), ("1", "0"), MappingProxyType({}), stack.waveform)
@@ -355,10 +367,10 @@ def loop_network(stack: Stack) -> Network:
         sources=(around,), n_voltage=1, cells=tuple(cells), layers=stack.layers, live=tuple(range(n)),
         areas=(Area(stack.layers[0].nodes[2], gap, stack.area_given),), contacts=(stack.contact,),
         gaps=(None if stack.gap is None else order.index(stack.gap),),
-        p=across[:, :n].copy(), q=across[:, n : n + 1].copy(), k=np.zeros((n, n)), b=np.zeros((n, 1)),
+        p=p, q=q, k=np.zeros((n, n)), b=np.zeros((n, 1)),
         through=(sign * slowest)[None], delivered=np.zeros((1, n + 1)),
         resistor_factor=np.zeros((0, n)), resistor_factor_s=np.zeros((0, 1)),
-        node_names=tuple(hop.node for hop in stack.hops[:-1]), nodes=0.0 - np.cumsum(drops, axis=0), stack=stack,
+        node_names=tuple(hop.node for hop in stack.hops[:-1]), nodes=nodes, stack=stack,
     )  # fmt: skip
 
 

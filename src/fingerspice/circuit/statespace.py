@@ -325,7 +325,7 @@ class Stack(Remembering):
         parts = tuple(wave if sign > 0 else Product((DC(-1.0), wave)) for wave, sign in waves if wave is not None)
         return Sum(parts) if len(parts) > 1 else parts[0] if parts else OFF
 
-    @property
+    @cached_property
     def state_order(self) -> tuple[int, ...]:
         """Cells in the order of the states; the last one has no state, as its voltage is the source's less all others.
 
@@ -434,6 +434,7 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
             needed = "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources"
             allowed = "for any network: simulate (run), plan, phasor (ac) and export"
             raise InputError(f"{needed}, and the circuit is another network; allowed {allowed}")
-        return replace(shared(circuit, ("stack", skin_at, circuit.work), lambda: build(*loop)), hops=loop[0])
+        found = shared(circuit, ("stack", skin_at, circuit.work), lambda: build(*loop))
+        return found if found.hops is loop[0] else replace(found, hops=loop[0])
 
     return circuit.remember(("stack", skin_at), make)

@@ -253,8 +253,9 @@ def _output_times(problem: Problem, jumps: str) -> FloatArray:
     at = np.unique(np.concatenate(found))
     if at.size:
         nearest = at[np.searchsorted(0.5 * (at[1:] + at[:-1]), grid)]
-        grid = grid[np.abs(grid - nearest) > 1e-9 * step]
-    return read_only(np.sort(np.concatenate([grid, at, at])))
+        grid, twice = grid[np.abs(grid - nearest) > 1e-9 * step], np.repeat(at, 2)
+        grid = np.insert(grid, grid.searchsorted(twice), twice)
+    return read_only(grid)
 
 
 PERIODS_PER_WINDOW, BREAKPOINTS_PER_WINDOW = 4096.0, 2000.0
