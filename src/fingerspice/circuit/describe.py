@@ -24,7 +24,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import MEANINGS, shown, unusual_of_changed
 from fingerspice.circuit.network import network_of, with_skin_held
-from fingerspice.circuit.statespace import build_stack, driving, driving_sources, shared
+from fingerspice.circuit.statespace import driving, driving_sources, shared
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.periodic import PWL, Burst, Repeat
@@ -486,10 +486,9 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> Ite
     if not skins or not 0.0 < t_stop < math.inf:
         return
     shares = waveform.remember(("outside", t_stop), lambda: energy_outside(waveform, t_stop), 1)
-    ends = f"below {SKIN_BAND[0]:g} Hz", f"above {SKIN_BAND[1] / 1e3:g} kHz"
-    found = [(share, where) for share, where in zip(shares, ends, strict=True) if share > NOTABLE]
-    parts = " and ".join(f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}" for share, where in found)
-    if found:
+    found = zip(shares, (f"below {SKIN_BAND[0]:g} Hz", f"above {SKIN_BAND[1] / 1e3:g} kHz"), strict=True)
+    far = (f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}" for share, where in found if share > NOTABLE)
+    if parts := " and ".join(far):
         yield f"of the source's energy {parts} lie outside the band of the data behind {skins[0].name}"
 
 
@@ -499,13 +498,13 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     It is the error of the linear response at one area (m^2) from the uncharged start to `t_stop` (s), by superposition
     of phasors, plus an estimate of the error due to the change of the area, `sensitivity` relative to the area.
     """
-    dispersive, frozen = build_stack(circuit), build_stack(circuit, skin_at=frequency)
+    networks = network_of(circuit), network_of(circuit, frequency)
     span = min(t_stop, _PERIODS / frequency)
-    u = _samples(dispersive.waveform, 0.0, span, _enough(span, 200.0 * frequency))
+    u = _samples(networks[0].waveform, 0.0, span, _enough(span, 200.0 * frequency))
     # The run is padded with zeros to twice its length, because the discrete transform is cyclic.
     lines = np.fft.rfft(u, 2 * u.size)
     f = np.arange(1, lines.size) / (2.0 * span)
-    gains = [layer_gains(stack.admittance(f, np.array([area])))[:, stack.gap_layer] for stack in (dispersive, frozen)]
+    gains = [layer_gains(one.admittances(f, np.array([area])))[:, one.gaps[0]] for one in networks]
     responses = (np.append(0.0, gain * lines[1:]) for gain in (gains[0], gains[1] - gains[0]))
     peak, missed = (float(np.abs(np.fft.irfft(one)[: u.size]).max()) for one in responses)
     return missed / peak + COUPLING * sensitivity if peak > 0.0 and math.isfinite(peak) else math.inf

@@ -28,7 +28,7 @@ from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import check
 from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of, find_branches, shared
 from fingerspice.physics.contact import Contact
-from fingerspice.physics.materials import skin_permittivity, skin_resistivity
+from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import layer_gains, settled_areas
 from fingerspice.waveforms.waveform import Sum, Waveform, refuse, require
 
@@ -156,7 +156,8 @@ class Network(Remembering):
         y = self.leak(area) + 2j * np.pi * f[..., None] * self.capacitance(area)
         for i, cell in enumerate(self.cells):
             if cell.element.device == "SKIN" and cell.area is not None:
-                y[..., i] = statespace.skin_admittance(cell.element, f, area[cell.area])
+                per_area = 1.0 / skin_resistivity(f) + 2j * np.pi * f * EPS0 * skin_permittivity(f)
+                y[..., i] = per_area * area[cell.area] / cell.element.values["d"]
         return np.asarray(y)
 
     def phasors(self, frequency: ArrayLike, area: FloatArray, s: ComplexArray) -> ComplexArray:
@@ -175,10 +176,10 @@ class Network(Remembering):
 
     def layer_gain(self, frequency: float, area: FloatArray) -> ComplexArray:
         """Ratio of each layer's voltage (from p to n) to the one source's, shape (n_layer,)."""
-        stack = self.stack
-        if stack is None:
+        if (stack := self.stack) is None:
             return np.asarray(self.grouping @ self.phasors(frequency, area, np.ones(1, complex)))
-        return np.asarray(layer_gains(stack.admittance(frequency, area))[0] * stack.sign[stack.first_cell])
+        gains = layer_gains(self.admittances(frequency, area)) * stack.sign[list(stack.state_order)]
+        return np.asarray(self.grouping @ gains)
 
     def impedance(self, frequency: float, area: FloatArray) -> complex:
         """Voltage of the one source over the current that it delivers, at a frequency (Hz), ohm."""
@@ -316,7 +317,10 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
         stack = build_stack(circuit, skin_at)
         network = shared(circuit, ("loop network", skin_at), lambda: loop_network(stack))
-        return network if network.stack is stack else replace(network, sources=(replace(network.sources[0], waveform=stack.waveform),), stack=stack)
+        if network.stack is not stack:
+            around = replace(network.sources[0], waveform=stack.waveform)
+            network = replace(network, sources=(around,), stack=stack)
+        return network
 
     return circuit.remember(("network", skin_at), make)
 
@@ -333,18 +337,14 @@ def checked(circuit: Circuit) -> Circuit:
 def _loop_voltages(
     hops: tuple[tuple[bool, float], ...], of_layer: tuple[int, ...], sign: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """`Network.p`, `q` and `nodes` of a loop: of each hop whether it is a source, and its sign; of each cell likewise.
-
-    Cell voltages follow from the states and the loop's voltage, node voltages also from each of several sources.
-    """
-    n, sources = len(sign) - 1, sum(is_source for is_source, _ in hops)
-    several = sources if sources > 1 else 0
-    across = np.zeros((n + 1, n + 1 + several))
-    across[:n, :n] = np.eye(n)
+    """`Network.p`, `q`, `nodes` of a loop: from each hop's sign, and whether it is a source, and from each cell's."""
+    # Cell voltages follow from the states and the loop's voltage, node voltages also from each of several sources.
+    n, sources, layer = len(sign) - 1, sum(is_source for is_source, _ in hops), count()
+    across = np.eye(n + 1, n + 1 + (sources if sources > 1 else 0))
     across[n, :n], across[n, n] = -sign[n] * np.array(sign[:n]), sign[n]
-    layer, source, one, cells = count(), count(n + (several > 0)), np.eye(across.shape[1]), np.array(of_layer)
+    own = iter(np.eye(across.shape[1])[n + (sources > 1) :])
     drops = [
-        turn * (one[next(source)] if is_source else across[cells == next(layer)].sum(axis=0))
+        turn * (next(own) if is_source else across[np.equal(of_layer, next(layer))].sum(axis=0))
         for is_source, turn in hops[:-1]
     ]
     return across[:, :n].copy(), across[:, n : n + 1].copy(), 0.0 - np.cumsum(drops, axis=0)

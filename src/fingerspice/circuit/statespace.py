@@ -10,7 +10,6 @@ sum v_x = 0 fixes the neutral gauge of the leaked charges. So N layers have N - 
 
 from __future__ import annotations
 
-import math
 import operator
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -22,13 +21,13 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from fingerspice.base.arrays import ComplexArray, FloatArray, Remembering, T
+from fingerspice.base.arrays import FloatArray, Remembering, T
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.physics.contact import Contact
-from fingerspice.physics.materials import EPS0, SKIN_LADDER, skin_permittivity, skin_resistivity
+from fingerspice.physics.materials import EPS0, SKIN_LADDER
 from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, refuse
 
 MAX_ELEMENTS = 2000  #: Largest number of elements of a circuit, because every matrix of a network is dense.
@@ -357,24 +356,6 @@ class Stack(Remembering):
     def leak_rates(self, area: float) -> FloatArray:
         """Leak rate of each cell, g/c, at an area (m^2), 1/s, shape (n_cell,)."""
         return np.asarray((self.g_total / area + self.g_area) / self.c)
-
-    def admittance(self, frequency: ArrayLike, area: ArrayLike) -> ComplexArray:
-        """Complex layer admittances (n_frequency, n_layer), S; SKIN has data at each frequency (Eqs. 9, 16 to 19)."""
-        f = np.atleast_1d(np.asarray(frequency, float))[:, None]
-        a = np.broadcast_to(np.asarray(area, float), (f.shape[0],))[:, None]
-        y = self.g_total + self.g_area * a + 2j * math.pi * f * self.c * a
-        if len(self.layers) < self.c.size:
-            y = 1.0 / np.add.reduceat(1.0 / y, self.first_cell, axis=1)
-        for i, layer in enumerate(self.layers):
-            if layer.device == "SKIN":
-                y[:, i] = skin_admittance(layer, f, a)[:, 0]
-        return np.asarray(y)
-
-
-def skin_admittance(skin: Element, f: FloatArray, area: FloatArray) -> ComplexArray:
-    """Complex admittance of a SKIN with its data at each frequency (Hz), S; `area` (m^2) is broadcast."""
-    per_area = 1.0 / skin_resistivity(f) + 2j * math.pi * f * EPS0 * skin_permittivity(f)
-    return np.asarray(per_area * area / skin.values["d"])
 
 
 def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:

@@ -293,8 +293,7 @@ class Tables:
         # rises out of next to nothing would be followed there beyond its own digits.
         peaks = [wave.kept.get("peak", (None, 0.0))[1] for wave in problem.network.waveforms]
         self.scales = [peak if np.isfinite(peak) else 0.0 for peak in peaks]
-        few = wave if len(self.edges) <= 1 + KEPT_WINDOWS else None
-        self.keeper: Remembering | None = Remembering() if wave.is_sampled else few
+        self.keeper = Remembering() if wave.is_sampled else wave if count <= KEPT_WINDOWS else None
 
     def __iter__(self) -> Iterator[list[SourceTable]]:
         for w0, w1 in itertools.pairwise(self.edges):

@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, IntArray, aligned
 from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within
-from fingerspice.numerics.chebyshev import to_powers
 from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES
-from fingerspice.numerics.modes import copy_to
 
 CONTROL = np.dtype([
     ("t", float),  # s
@@ -194,21 +192,9 @@ def end_at(theta: float, x: Modal, error: FloatArray) -> None:
 
 @jit_rows
 def _values_at(
-    series: FloatArray, powers: bool, t_out: FloatArray, t: float, scale: float, top: float, groups: int,
-    out: FloatArray,
+    series: FloatArray, t_out: FloatArray, t: float, scale: float, top: float, groups: int, out: FloatArray
 ) -> None:  # fmt: skip
-    """The series at whole groups of times, so that all round alike: the inner loops are unrolled, the outer a vector.
-
-    With `powers` it has the coefficients of 1, x, x^2, ..., which halve the work.
-    """
-    if powers:
-        for i in range(_GROUP * groups):
-            x = min(max((t_out[i] - t) * scale - 1.0, -1.0), top)
-            value = series[NODES - 1]
-            for d in range(NODES - 2, -1, -1):
-                value = value * x + series[d]
-            out[i] = value
-        return
+    """The series at whole groups of times, so that all round alike: the inner loop is unrolled, the outer a vector."""
     for i in range(_GROUP * groups):
         x = min(max((t_out[i] - t) * scale - 1.0, -1.0), top)
         twice = 2.0 * x
@@ -222,11 +208,8 @@ def _values_at(
 
 
 @jit
-def _outputs_within(first: int, guess: int, low: float, high: float, t_out: FloatArray, left: NDArray[np.bool_]) -> int:
+def _outputs_within(first: int, low: float, high: float, t_out: FloatArray, left: NDArray[np.bool_]) -> int:
     """Number of outputs from number `first` on that lie in a step, known to be between `low` and `high`."""
-    after = first + guess
-    if guess > 0 and after <= t_out.size and t_out[after - 1] < low and (after == t_out.size or t_out[after] > high):
-        return guess
     at = first
     while at + _STRIDE <= t_out.size and t_out[at + _STRIDE - 1] < low:
         at += _STRIDE
@@ -237,17 +220,15 @@ def _outputs_within(first: int, guess: int, low: float, high: float, t_out: Floa
 
 @jit
 def write_outputs(
-    t: float, h: float, reached: float, t_new: float, slack: float, powers: bool, series: FloatArray, first: int,
-    guess: int, outputs: Outputs,
+    t: float, h: float, reached: float, t_new: float, slack: float, series: FloatArray, first: int, outputs: Outputs
 ) -> int:  # fmt: skip
     """Outputs of one step from number `first` on: right-hand ones in [t, t_new), left-hand ones in (t, t_new].
 
-    With `powers` the series holds the coefficients of 1, x, x^2, ... instead. Times within `slack` of t_new are t_new;
-    `guess` is the expected number. Places after the last output are overwritten: they belong to later steps.
+    Times within `slack` of t_new are t_new. Places after the last output are overwritten: they belong to later steps.
     Returns how many there were.
     """
     t_out, out = outputs.t, outputs.columns
-    count = _outputs_within(first, guess, t_new - slack, t_new + slack, t_out, outputs.left)
+    count = _outputs_within(first, t_new - slack, t_new + slack, t_out, outputs.left)
     groups = (count + _GROUP - 1) // _GROUP
     scale = 2.0 / h
     top = 2.0 * reached - 1.0
@@ -255,12 +236,12 @@ def write_outputs(
     whole = groups if first + _GROUP * groups <= t_out.size else groups - 1
     rest = first + _GROUP * whole
     for column in range(out.shape[0]):
-        _values_at(series[column], powers, t_out[first:], t, scale, top, whole, out[column, first:])
+        _values_at(series[column], t_out[first:], t, scale, top, whole, out[column, first:])
         if whole < groups:
             work = np.empty((2, _GROUP))
             for i in range(_GROUP):
                 work[0, i] = t_out[min(rest + i, t_out.size - 1)]
-            _values_at(series[column], powers, work[0], t, scale, top, 1, work[1])
+            _values_at(series[column], work[0], t, scale, top, 1, work[1])
             for i in range(t_out.size - rest):
                 out[column, rest + i] = work[1, i]
     return count
@@ -305,14 +286,13 @@ def repeat(
 ) -> int:  # fmt: skip
     """Write the outputs, from number `first` on, of so many periods (s) that follow the kept one of `count` steps.
 
-    `drifts` (n_column,) are the gains of the columns in a period; only charges have one, C. The kept values are used
-    up. Returns the first output that is left.
+    `drifts` (n_column,) are the gains of the columns in a period; only charges have one, C. Returns the first output
+    that is left.
     """
-    # Of each step: its outputs in the period before, and whether it is in powers of x.
-    held, as_powers, most = np.zeros(count, np.int64), np.zeros(count, np.bool_), max(1, AT_ONCE // max(1, count))
-    for begin in range(0, periods, most):
-        end = min(begin + most, periods)
-        first = _repeat(kept, held, as_powers, period, begin + 1, end + 1, drifts, first, outputs)
+    series, most = np.empty((count, outputs.columns.shape[0], ROWS)), max(1, AT_ONCE // max(1, count))
+    for begin in range(1, periods + 1, most):
+        end = min(begin + most, periods + 1)
+        first = _repeat(kept, series, period, begin, end, drifts, first, outputs)
         if first >= outputs.t.size:
             break
     return first
@@ -320,20 +300,25 @@ def repeat(
 
 @jit
 def _repeat(
-    kept: Steps, held: IntArray, as_powers: NDArray[np.bool_], period: float, begin: int, end: int, drifts: FloatArray,
-    first: int, outputs: Outputs,
+    kept: Steps, series: FloatArray, period: float, begin: int, end: int, drifts: FloatArray, first: int,
+    outputs: Outputs,
 ) -> int:  # fmt: skip
-    """As `repeat`, of the periods from `begin` to before `end`."""
-    times, series = borrow(kept.times), borrow(kept.values)
+    """As `repeat`, of the periods from `begin` to before `end`; `series` is room for the steps' series."""
+    times, values, series = borrow(kept.times), borrow(kept.values), borrow(series)
     outputs, drifts = borrow(outputs), borrow(drifts)
-    t_out, out = outputs.t, outputs.columns
-    held, as_powers = borrow(held), borrow(as_powers)
-    if begin == 1:
-        _make_series(series, as_powers)
+    t_out, out, count = outputs.t, outputs.columns, series.shape[0]
+    for i in range(count):
+        for c in range(out.shape[0]):
+            series_of(values[i, c], series[i, c])
+    start, size = first, 0
     for k in range(begin, end):
-        shift = k * period
-        before = first
-        for i in range(held.size):
+        shift, later, before = k * period, k - begin, first
+        if later and _alike(outputs, start, first, size, later * period, times[count - 1, 2] + shift):
+            for c in range(out.shape[0]):
+                _moved(out[c, start : start + size], later * drifts[c], out[c, first : first + size])
+            first += size
+            continue
+        for i in range(count):
             if first >= t_out.size:
                 break
             stop = times[i, 2] + shift
@@ -342,32 +327,32 @@ def _repeat(
                 continue
             h = times[i, 1]
             reached = (times[i, 2] - times[i, 0]) / h
-            # Mostly a period has as many outputs as the one before.
-            held[i] = write_outputs(
-                times[i, 0] + shift, h, min(reached, 1.0), stop, slack, as_powers[i], series[i], first, held[i], outputs
-            )  # fmt: skip
-            first += held[i]
+            first += write_outputs(times[i, 0] + shift, h, min(reached, 1.0), stop, slack, series[i], first, outputs)
         for c in range(out.shape[0]):
             if drifts[c] != 0.0:
                 for i in range(before, first):
                     out[c, i] += k * drifts[c]
+        size = size if later else first - start
     return first
 
 
-@jit
-def _make_series(values: FloatArray, as_powers: NDArray[np.bool_]) -> None:
-    """Turn values at the nodes (n_step, n_column, NODES) into coefficients of 1, x, x^2, ..., which halve the work.
+@jit_rows
+def _alike(outputs: Outputs, start: int, first: int, size: int, shift: float, stop: float) -> bool:
+    """Whether the outputs up to the end of a period, `stop` (s), are so many from `start` on, `shift` (s) later."""
+    t, left = outputs.t, outputs.left
+    if first + size > t.size or (first + size < t.size and not t[first + size] > stop * (1.0 + SAME_TIME)):
+        return False
+    t, own, off = t[first : first + size], t[start : start + size], 0
+    side, own_side = left[first : first + size], left[start : start + size]
+    for i in range(size):
+        off += (abs(t[i] - own[i] - shift) > SAME_TIME * stop) | (side[i] != own_side[i])
+    return off == 0
 
-    Where these are less exact they become those of Chebyshev series; `as_powers` (n_step,) marks the other steps.
-    """
-    series = np.zeros((values.shape[1], ROWS))
-    for i in range(as_powers.size):
-        as_powers[i] = True
-        for c in range(values.shape[1]):
-            series_of(values[i, c], series[c])
-            as_powers[i] &= to_powers(series[c, :NODES], values[i, c])
-        if not as_powers[i]:
-            copy_to(values[i], series[:, :NODES])
+
+@jit_rows
+def _moved(x: FloatArray, by: float, out: FloatArray) -> None:
+    for i in range(out.size):
+        out[i] = x[i] + by
 
 
 # Codes returned by the loop: the end is reached; no step is short enough (a fold, or an error that cannot be met); a
@@ -480,6 +465,4 @@ def write_step(s: LoopState, t: float, x: Modal) -> None:
     if first < s.outputs.t.size and s.outputs.t[first] <= step.t_new:
         for c in range(s.outputs.columns.shape[0]):
             series_of(values[c], coefficients[c])
-        counters[OUTPUT] += write_outputs(
-            t, step.length, step.theta, step.t_new, 0.0, False, coefficients, first, 0, s.outputs
-        )  # fmt: skip
+        counters[OUTPUT] += write_outputs(t, step.length, step.theta, step.t_new, 0.0, coefficients, first, s.outputs)
