@@ -89,16 +89,16 @@ def run(
       fingerspice run circuits/fingerpad.cir --finger moist --coating 3M-insulating --drive Fig4-5kHz
       fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,f_t
     """
-    from fingerspice.plots.schematic import put_beside
     from fingerspice.solve.simulation import check_arguments, simulate
 
+    if schematic:  # Only then: it loads matplotlib, which takes as long as a run.
+        from fingerspice.plots.schematic import put_beside
     circuit, start = with_times(job.read(), job.stop, start)
     if circuit.tran is None:
         raise InputError(f"{job.deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
-    fixed = area_from_text(area)
-    check_arguments(job.rtol, method, fixed, start, jumps)
-    how: dict[str, Any] = {"charge_law": job.charge_law, "area": fixed, "rtol": job.rtol, "method": method}
-    how |= {"start": start, "t_stop": None if job.stop is None else circuit.tran.stop}
+    how: dict[str, Any] = {"area": area_from_text(area), "start": start, "rtol": job.rtol, "method": method}
+    check_arguments(**how, jumps=jumps)
+    how |= {"charge_law": job.charge_law, "t_stop": None if job.stop is None else circuit.tran.stop}
     if stream or chunk or signals or netcdf:
         from fingerspice.cli.store import run_streamed
 
