@@ -248,7 +248,7 @@ def test_a_parameter_near_whose_value_there_is_no_period_is_refused_in_a_periodi
 
 def test_a_frozen_area_has_them(table_1: fs.Circuit) -> None:
     # A linear circuit: voltages are as the amplitude, forces as its square.
-    run = fs.simulate(table_1, t_stop=0.02, area="frozen", sensitivities=("Vdrive.amplitude",))
+    run = fs.simulate(table_1, t_stop=0.02, area="frozen", sensitivities=("source.amplitude",))
     by = run.sensitivities["Vdrive.amplitude"]
     np.testing.assert_allclose(by.value * by.u_gap, run.u_gap, atol=1e-10 * np.abs(run.u_gap).max())
     np.testing.assert_allclose(by.value * by.f_el, 2.0 * run.f_el, atol=1e-10 * run.f_el.max())

@@ -201,6 +201,30 @@ def test_a_run_that_fails_gives_what_came_before() -> None:
     assert caught.value.solution.t[-1] == pytest.approx(0.12345, abs=1e-4)
 
 
+def test_a_run_to_a_fold_ends_as_the_whole_one() -> None:
+    circuit = table1().replace({"Xgap.d": 1e-6, "Vdrive": fs.Sine(1500.0, 100.0)})
+    with pytest.raises(fs.SolveError) as whole:
+        fs.simulate(circuit, charge_law="mobile", rtol=1e-6)
+    with pytest.raises(fs.SolveError) as caught:
+        list(fs.stream(circuit, step=1e-5, count=30, charge_law="mobile", rtol=1e-6))
+    one, other = whole.value.failure, caught.value.failure
+    assert other.status is one.status is fs.Status.FOLD
+    assert caught.value.solution.t[-1] == other.t == pytest.approx(one.t, rel=1e-6)
+    assert (other.u_gap, other.area) == pytest.approx((one.u_gap, one.area), rel=1e-3)
+
+
+def test_what_was_stated_stays_where_another_method_takes_over() -> None:
+    # A loud piece, then a quiet one whose end is louder than what the polynomials cover.
+    current = 2e-4 * recording_errors.noise(5, 3 << 15, RATE, 50.0, 4000.0)
+    current[1 << 15 :] *= 1e-3
+    current[3 << 14 : (3 << 14) + 2000] *= 1e4
+    source = fs.Samples(current, RATE)
+    stream = fs.stream(shipped("current_drive"), sources=source, t_stop=2.0, count=8192, rtol=1e-4)
+    chunks = [next(stream) for _ in range(6)]
+    assert [chunk.method for chunk in chunks] == [*["relaxation"] * 4, *["exponential"] * 2]
+    assert np.all(np.diff([chunk.error.u_gap for chunk in chunks]) >= 0.0)
+
+
 # Recordings in files --------------------------------------------------------------------------------------------------
 
 

@@ -214,6 +214,20 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
     return circuit.replace({circuit[name].name: value for name, value in sources.items()})
 
 
+def own_path(circuit: Circuit, path: Any) -> str:
+    """A path in the circuit's own spelling; ``source.`` stands for the only source."""
+    if isinstance(path, str) and path.lower().startswith("source."):
+        on = driving_sources(circuit)
+        if not any(e.name.lower() == "source" for e in circuit.elements) and len(on) == 1:
+            path = f"{on[0].name}.{path.partition('.')[2]}"
+    known = {name.lower(): name for name in circuit.parameters}
+    if not isinstance(path, str) or path.lower() not in known:
+        # The circuit raises the error about an unknown path, which gives the nearest name.
+        circuit.varied({path: 1.0})
+        raise InputError(f"{path!r} is no parameter that takes numbers; allowed: a path such as 'Xgap.d'")
+    return known[path.lower()]
+
+
 def require_circuit(circuit: Any) -> None:
     """Refuse anything but a circuit, and say how a circuit is made."""
     allowed = "a Circuit, such as fs.read_netlist('deck.cir') gives"

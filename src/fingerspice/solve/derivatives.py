@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.describe import own_path
 from fingerspice.circuit.network import network_of
 from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, lead, sum_back
 from fingerspice.numerics.modes import AT, STEP, derivative
@@ -59,11 +60,7 @@ class _Parameter:
     """A parameter by which a run is differentiated; refused if it is unknown, or not covered."""
 
     def __init__(self, problem: Problem, path: str) -> None:
-        self.circuit, known = problem.circuit, {name.lower(): name for name in problem.circuit.parameters}
-        if path.lower() not in known:
-            # Refused with the nearest name.
-            self.circuit.varied({path: 1.0})
-        self.path = known[path.lower()]
+        self.circuit, self.path = problem.circuit, own_path(problem.circuit, path)
         parameter = self.circuit.parameters[self.path]
         self.value, self.unit, self.step = parameter.value, parameter.unit, _STEP
         said = f"sensitivities names {self.path}, which is {self.value:g}; allowed: parameters whose value is finite"

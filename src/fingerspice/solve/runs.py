@@ -240,7 +240,7 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         _, off, place = run.unseen
         element, device = ", ".join(_written(problem, place)), problem.network.sources[place].device
         cause += f" (by {off:.3g} {'A' if device == 'I' else 'V'})"
-    elif status is Status.FOLD and run.t.size and record.fingers:
+    elif status is Status.FOLD and record.t.size and record.fingers:
         if run.t_failed is not None and breakpoints_at(problem.network.waveform, run.t_failed).size:
             cause += " (the source jumps past the fold at this time)"
         areas = record.each("area")

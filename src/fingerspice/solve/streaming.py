@@ -163,8 +163,8 @@ class Stream:
         try:
             march.follow(run_at, out)
         except LostError:
-            # The state before this piece.
-            self._last, self._march = replace(self._last, state=march.state), None
+            # The state before this piece, and what has been stated so far.
+            self._last, self._march = march.run(*_NO_OUTPUTS), None
             return self._window()
         count = march.outputs
         self._written += count
@@ -185,7 +185,8 @@ class Stream:
             run.gaps = np.maximum(run.gaps, self._last.gaps)
         self._last, self._written = run, self._written + run.t.size
         # In the form of exponential steps, whichever method has computed them.
-        return t[: run.t.size], run.rows if run.by_layer else as_shown(whole.scene, run.rows)
+        t = t[: run.t.size] if run.status is Status.SUCCESS else run.t
+        return t, run.rows if run.by_layer else as_shown(whole.scene, run.rows)
 
     def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
         problem = self.problem

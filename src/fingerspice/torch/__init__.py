@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import FloatArray, positive_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import require_circuit
+from fingerspice.circuit.describe import own_path, require_circuit
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.solution import DERIVED, MEANS, Solution
 from fingerspice.solve.simulation import rtol_given, simulate
-from fingerspice.studies.batch.batch import LEAST_RTOL, REFUSED, batch, own_path
+from fingerspice.studies.batch.batch import LEAST_RTOL, REFUSED, batch
 from fingerspice.studies.batch.lockstep import lockstep_form, why_alone
 from fingerspice.studies.steady import steady_state
 from fingerspice.waveforms.samples import Samples

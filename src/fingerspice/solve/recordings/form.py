@@ -211,10 +211,6 @@ class LaneForm(ABC):
         rows, bend = self.rows, 0.0 if self.mobile else self.bend(np.array(xi))
         return np.asarray(rows.columns @ z[: self.lanes.rates.size] + rows.bends * bend + rows.k * source)
 
-    def after(self, z: FloatArray, to: float) -> float:
-        """xi (V) after a jump of the source to `to`; of a stack under `mobile`, NaN where it meets a fold."""
-        return self.xi_at(z, to)
-
 
 def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
     """A Chebyshev series in powers, of a degree 4 k, and what that lacks; empty if more than `tol`."""
@@ -279,6 +275,7 @@ class StackForm(LaneForm):
         return np.append(z, u_gap) if self.mobile else z, before
 
     def after(self, z: FloatArray, to: float) -> float:
+        """Under `mobile` the gap voltage (V) after a jump of the source to `to`; NaN where it meets a fold."""
         model = self.system.model
         return float(ramp(model, model.k_gap * to, dot(self.system.gap[0], z), float(z[-1])))
 

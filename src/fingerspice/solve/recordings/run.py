@@ -19,7 +19,7 @@ from fingerspice.engine.lanes.loops import flow, show
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import OF_FORCE, Block, Piece, driving, pieces_of, ready, spacing_of
-from fingerspice.solve.recordings.form import PIECES, LaneForm
+from fingerspice.solve.recordings.form import PIECES, LaneForm, StackForm
 from fingerspice.solve.runs import Progress, Run, closed_form, excess_of
 from fingerspice.waveforms.sampling import on_grid
 
@@ -149,7 +149,9 @@ class LaneMarch:
             if solved:
                 peak = float(block.peaks.max())
                 # Under `mobile` the run stays on the branch on which it starts.
-                near = not form.mobile or abs(block.xi[0] - form.after(self.z, float(block.x[0]))) <= 0.01 * peak
+                near = not (form.mobile and isinstance(form, StackForm)) or (
+                    abs(block.xi[0] - form.after(self.z, float(block.x[0]))) <= 0.01 * peak
+                )
                 if not (near and block.on_one_branch and form.gap(np.array(peak)) <= form.u_top):
                     raise LostError
                 peak = max(peak, self.peak)

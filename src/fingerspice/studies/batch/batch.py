@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from fingerspice.base.arrays import FloatArray, IntArray, positive_number, real_numbers, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import require_circuit, scenes_warnings
+from fingerspice.circuit.describe import own_path, require_circuit, scenes_warnings
 from fingerspice.circuit.statespace import driving_sources
 from fingerspice.engine.lockstep.card import require_card
 from fingerspice.results.outcome import SolveError
@@ -155,20 +155,6 @@ def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dic
         i = int(np.argmax(bad))
         require(not bad[i], path, f"{array[i]:g} in scene {i}", allowed)
     return scenes
-
-
-def own_path(circuit: Circuit, path: Any) -> str:
-    """A path in the circuit's own spelling."""
-    if isinstance(path, str) and path.lower().startswith("source."):
-        on = driving_sources(circuit)
-        if not any(e.name.lower() == "source" for e in circuit.elements) and len(on) == 1:
-            path = f"{on[0].name}.{path.partition('.')[2]}"
-    known = {name.lower(): name for name in circuit.parameters}
-    if not isinstance(path, str) or path.lower() not in known:
-        # The circuit raises the error about an unknown path, which gives the nearest name.
-        circuit.varied({path: 1.0})
-        raise InputError(f"{path!r} is no parameter that takes numbers; allowed: a path such as 'Xgap.d'")
-    return known[path.lower()]
 
 
 def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None:

@@ -21,13 +21,13 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page
 from fingerspice.circuit import devices
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
-from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
+from fingerspice.circuit.describe import meaning_of, own_path, require_circuit, scenes_warnings
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import driving_sources
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given, simulate
-from fingerspice.studies.batch.batch import REFUSED, batch, own_path
+from fingerspice.studies.batch.batch import REFUSED, batch
 from fingerspice.studies.fit.fitting import FARTHEST, NOT_FOUND, SIGMA, FitResult, Given, Problem, followed, measured_of
 from fingerspice.studies.steady import phasor
 from fingerspice.waveforms.waveform import Sine, refuse, require

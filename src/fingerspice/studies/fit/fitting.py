@@ -46,6 +46,7 @@ def measured_of(
         place, given = f"the data in '{Path(given)}'", _from_table(Path(given), meaning, example, by)
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
+    refuse(not given, f"{place} have no columns; allowed: measured values and their conditions, such as {example}")
     missing = by is not None and by not in given
     refuse(missing, f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
     columns = {name: real_numbers(f"data column {name!r}", x, "numbers") for name, x in given.items() if name != by}

@@ -17,8 +17,8 @@ from fingerspice import sets
 from fingerspice.base.arrays import FloatArray, Remembering, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import require_circuit
-from fingerspice.studies.batch.batch import REFUSED, batch, own_path
+from fingerspice.circuit.describe import own_path, require_circuit
+from fingerspice.studies.batch.batch import REFUSED, batch
 from fingerspice.waveforms.waveform import Waveform, refuse, require
 
 if TYPE_CHECKING:
