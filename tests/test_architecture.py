@@ -19,11 +19,11 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along.
-ALL_LINES = 34_561
+ALL_LINES = 34_515
 ALL_FILES = 128
 PACKAGE_LINES = {
     "base": 1_028, "circuit": 2_007, "cli": 1_449, "engine": 7_156, "explorer": 1_184, "netlist": 2_019,
-    "numerics": 1_198, "physics": 457, "plots": 1_202, "results": 2_354, "sets": 361, "solve": 5_434,
+    "numerics": 1_170, "physics": 439, "plots": 1_202, "results": 2_354, "sets": 361, "solve": 5_434,
     "studies": 5_951, "torch": 373, "waveforms": 2_239,
 }  # fmt: skip
 

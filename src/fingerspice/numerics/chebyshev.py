@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import lru_cache
 
@@ -15,12 +14,12 @@ from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 
 def nodes(n: int, lo: float, hi: float) -> FloatArray:
     """Chebyshev points of the first kind on [lo, hi], ascending, shape (n,)."""
-    return 0.5 * (lo + hi) + 0.5 * (hi - lo) * np.cos(_angles(n))
+    return 0.5 * (lo + hi) + 0.5 * (hi - lo) * _nodes(n)
 
 
 @lru_cache(maxsize=32)
-def _angles(n: int) -> FloatArray:
-    return np.asarray((np.arange(n)[::-1] + 0.5) * np.pi / n)
+def _nodes(n: int) -> FloatArray:
+    return np.asarray(np.cos((np.arange(n)[::-1] + 0.5) * np.pi / n))
 
 
 def coefficients(values: FloatArray) -> FloatArray:
@@ -31,7 +30,9 @@ def coefficients(values: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=32)
 def _transform(n: int) -> FloatArray:
-    matrix: FloatArray = np.cos(np.outer(np.arange(n), _angles(n))) * (2.0 / n)
+    # Parts of a turn, of which there are 4 n: the cosine of a large angle has fewer digits.
+    parts = np.outer(np.arange(n), 2 * np.arange(n)[::-1] + 1) % (4 * n)
+    matrix: FloatArray = np.cos(parts * (0.5 * np.pi / n)) * (2.0 / n)
     matrix[0] *= 0.5
     return matrix
 
@@ -46,41 +47,12 @@ def fit(
     for size in sizes:
         c = coefficients(function(nodes(size, lo, hi)))
         magnitude = np.abs(c)
-        if np.all(np.isfinite(c)) and magnitude[-2:].max() <= tol * magnitude.max():
+        least = tol * float(magnitude.max())
+        if least < np.inf and magnitude[-2] <= least and magnitude[-1] <= least:
             # Below twice that the function's own rounding stands, not the series.
-            keep = np.flatnonzero(magnitude > 2.0 * tol * magnitude.max())
-            return np.ascontiguousarray(c[: (keep[-1] + 1 if keep.size else 1)])
+            keep = np.flatnonzero(magnitude > 2.0 * least)
+            return c[: (keep[-1] + 1 if keep.size else 1)]
     return None
-
-
-@jit
-def series_through(values: FloatArray, tol: float, c: FloatArray) -> int:
-    """Coefficients `c` (n,) of the interpolant through values at Chebyshev's points, in descending order of these.
-
-    Returns how many of them count, or 0 where the last two are above `tol` of the largest, or one is not finite.
-    """
-    n = values.size
-    largest = 0.0
-    # All the cosines that there are, of 4 n equal parts of a turn.
-    cosine = np.empty(4 * n)
-    for j in range(4 * n):
-        cosine[j] = math.cos(j * (0.5 * math.pi / n))
-    for k in range(n):
-        total = 0.0
-        for i in range(n):
-            total += values[i] * cosine[(2 * i + 1) * k % (4 * n)]
-        c[k] = total * (1.0 if k == 0 else 2.0) / n
-        if not abs(c[k]) < math.inf:
-            return 0
-        largest = max(largest, abs(c[k]))
-    if max(abs(c[n - 1]), abs(c[n - 2])) > tol * largest:
-        return 0
-    kept = 1
-    for k in range(n):
-        # Below twice that the function's own rounding stands, not the series.
-        if abs(c[k]) > 2.0 * tol * largest:
-            kept = k + 1
-    return kept
 
 
 @jit

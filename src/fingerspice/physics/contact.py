@@ -25,7 +25,7 @@ from fingerspice.physics.materials import EPS0
 N_PACKED = 8
 """Length of the parameter vector that the compiled functions take."""
 # Terms that a curve may have, and its error, relative.
-_SIZES, _ERROR = (16, 24, 32, 48), 2e-15
+_SIZES, _ERROR = (32, 48), 2e-15
 
 
 @dataclass(frozen=True)
@@ -125,28 +125,10 @@ class Contact:
         the kink stays smooth. Where no short series reaches rounding, the exact solution is used instead.
         """
         # The continuation exists while 1 + x y^p > 0; x = -0.2 is well inside for every legal exponent pair.
-        return np.asarray(_curve(-min(0.3 * u_max, 0.2 / float(self.packed[0])), u_max, self.packed))
-
-
-@jit
-def _curve(lo: float, hi: float, packed: FloatArray) -> FloatArray:
-    """The ends of a range (V), a contact's constants, and the series of 1/A_R over that range, if there is one."""
-    head = 2 + packed.size
-    for size in _SIZES:
-        out = np.empty(head + size)
-        values = np.empty(size)
-        for i in range(size):
-            x = math.cos((i + 0.5) * math.pi / size)
-            values[i] = 1.0 / ridge_area(0.5 * (lo + hi) + 0.5 * (hi - lo) * x, packed)
-        kept = chebyshev.series_through(values, _ERROR, out[head:])
-        if kept > 0:
-            break
-        out = out[:head]
-    out[0] = lo
-    out[1] = hi
-    for i in range(packed.size):
-        out[2 + i] = packed[i]
-    return out[: head + max(kept, 0)].copy()
+        lo, packed = -min(0.3 * u_max, 0.2 / float(self.packed[0])), self.packed
+        with np.errstate(all="ignore"):
+            series = chebyshev.fit(lambda u: 1.0 / ridge_area_array(u, packed), lo, u_max, _ERROR, _SIZES)
+        return np.concatenate([[lo, u_max], packed, () if series is None else series])
 
 
 def fixed_area_curve(area: float) -> FloatArray:
