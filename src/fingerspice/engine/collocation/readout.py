@@ -290,9 +290,10 @@ def repeat(
     that is left.
     """
     series, most = np.empty((count, outputs.columns.shape[0], ROWS)), max(1, AT_ONCE // max(1, count))
+    own = np.array([first, -1])  # Of the first of these periods, which others copy: its first output, and their number
     for begin in range(1, periods + 1, most):
         end = min(begin + most, periods + 1)
-        first = _repeat(kept, series, period, begin, end, drifts, first, outputs)
+        first = _repeat(kept, series, period, begin, end, drifts, first, outputs, own)
         if first >= outputs.t.size:
             break
     return first
@@ -301,7 +302,7 @@ def repeat(
 @jit
 def _repeat(
     kept: Steps, series: FloatArray, period: float, begin: int, end: int, drifts: FloatArray, first: int,
-    outputs: Outputs,
+    outputs: Outputs, own: IntArray,
 ) -> int:  # fmt: skip
     """As `repeat`, of the periods from `begin` to before `end`; `series` is room for the steps' series."""
     times, values, series = borrow(kept.times), borrow(kept.values), borrow(series)
@@ -310,12 +311,11 @@ def _repeat(
     for i in range(count):
         for c in range(out.shape[0]):
             series_of(values[i, c], series[i, c])
-    start, size = first, 0
     for k in range(begin, end):
-        shift, later, before = k * period, k - begin, first
-        if later and _alike(outputs, start, first, size, later * period, times[count - 1, 2] + shift):
+        shift, before, start, size = k * period, first, own[0], own[1]
+        if size >= 0 and _alike(outputs, start, first, size, shift - period, times[count - 1, 2] + shift):
             for c in range(out.shape[0]):
-                _moved(out[c, start : start + size], later * drifts[c], out[c, first : first + size])
+                _moved(out[c, start : start + size], (k - 1) * drifts[c], out[c, first : first + size])
             first += size
             continue
         for i in range(count):
@@ -325,14 +325,14 @@ def _repeat(
             slack = SAME_TIME * abs(stop)
             if t_out[first] > stop + slack:
                 continue
-            h = times[i, 1]
-            reached = (times[i, 2] - times[i, 0]) / h
+            h, reached = times[i, 1], (times[i, 2] - times[i, 0]) / times[i, 1]
             first += write_outputs(times[i, 0] + shift, h, min(reached, 1.0), stop, slack, series[i], first, outputs)
         for c in range(out.shape[0]):
             if drifts[c] != 0.0:
                 for i in range(before, first):
                     out[c, i] += k * drifts[c]
-        size = size if later else first - start
+        if k == 1:
+            own[1] = first - before
     return first
 
 
