@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
-from fingerspice.physics.contact import Contact
+from fingerspice.physics.contact import JkrContact
 
 FloatArray = NDArray[np.float64]
 DECK = Path(__file__).resolve().parent.parent / "circuits" / "fingerpad.cir"
@@ -192,7 +192,7 @@ class Constants:
     stress: float
 
 
-def area_series(contact: Contact, reach: float, error: float = SERIES_ERROR, degrees: int = 24) -> tuple[float, ...]:
+def area_series(contact: JkrContact, reach: float, error: float = SERIES_ERROR, degrees: int = 24) -> tuple[float, ...]:
     """Power series of 1/A_R (1/m^2) in 2 |u_gap| / `reach` - 1, with a relative error of at most `error`.
 
     Raises

@@ -15,7 +15,7 @@ import numpy as np
 import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.numerics.lobatto import NODES, POINTS
-from fingerspice.physics.contact import Contact
+from fingerspice.physics.contact import JkrContact
 from fingerspice.plots.drawing import BLACK, BLUE, GREY, SKY, VERMILION, dress, legend_above, new_figure, save
 
 HERE = Path(__file__).parent
@@ -35,7 +35,7 @@ def finger(name: str = "fingerpad") -> fs.Circuit:
     return fs.read_netlist(CIRCUITS / f"{name}.cir")
 
 
-def contact_of(circuit: fs.Circuit) -> Contact:
+def contact_of(circuit: fs.Circuit) -> JkrContact:
     """The contact of a series stack."""
     contact = build_stack(circuit).contact
     assert contact is not None

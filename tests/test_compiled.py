@@ -27,9 +27,9 @@ faults = pytest.mark.skipif(sys.platform != "linux", reason="faults are made by 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 
 AREA = """
-from fingerspice.physics.contact import ridge_area, universal_curve, Contact
+from fingerspice.physics.contact import ridge_area, universal_curve, JkrContact
 universal_curve(0.0, 1.9, 1.1)
-c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)
+c = JkrContact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)
 print(repr(ridge_area(0.0, c.packed)))
 """
 # Each of the two functions that Python calls has two files.

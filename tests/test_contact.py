@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import fingerspice as fs
 from analytic import TABLE1, Parameters, area_mp, contact, jkr_area, jkr_parameters, work_factor
 from fingerspice.circuit.statespace import build_stack
-from fingerspice.physics.contact import Contact, inverse_area, ridge_area, universal_curve
+from fingerspice.physics.contact import JkrContact, inverse_area, ridge_area, universal_curve
 from fingerspice.physics.materials import SKIN_LADDER
 from scenes import cases, dispersive_deck, table1
 
@@ -19,8 +19,8 @@ SEARCH = settings(max_examples=60, derandomize=True, deadline=None)
 MM2 = 1e6
 
 
-def from_parameters(p: Parameters, work_ratio: float = 1.0) -> Contact:
-    return Contact(p.d_a, p.eps_a, p.force_normal, p.mu0, p.alpha, p.m, p.beta, p.n, p.c2, work_ratio)
+def from_parameters(p: Parameters, work_ratio: float = 1.0) -> JkrContact:
+    return JkrContact(p.d_a, p.eps_a, p.force_normal, p.mu0, p.alpha, p.m, p.beta, p.n, p.c2, work_ratio)
 
 
 PAPER = from_parameters(TABLE1)
@@ -145,7 +145,7 @@ def test_any_fingers_area_agrees_with_equations_1_to_4_solved_to_40_digits(p: Pa
 )
 def test_hertz_exponents_give_the_area_of_jkr_theory(radius, e_star, force, u, d):
     m, n, alpha, beta = jkr_parameters(radius, e_star)
-    c = Contact(d, 1.0, force, 0.0, alpha, m, beta, n, 0.0)
+    c = JkrContact(d, 1.0, force, 0.0, alpha, m, beta, n, 0.0)
     w = 8.854e-12 * u**2 / (2.0 * d)
     assert float(c.area_adhesive(u)) == pytest.approx(jkr_area(force, w, e_star, radius), rel=1e-13)
     assert float(c.area(u)) == float(c.area_adhesive(u)), "without friction nothing is lost"
@@ -223,7 +223,7 @@ def test_a_contact_that_friction_takes_away_is_refused_before_the_run_exactly_wh
     # A0^2 = c2 mu^2 F^2 in Table 1's numbers, mm and N: A0 = 37.937 mm^2 = sqrt(c2) mu fn at this mu.
     limit = 54.4 * 0.5**0.52 / (math.sqrt(5000.0) * 0.5)
     assert PAPER.exists
-    assert not Contact(3.5e-6, 1.0, 0.5, limit * 1.0001, 54.4e-6, 0.52, TABLE1.beta, 1.41, 5e-9).exists
+    assert not JkrContact(3.5e-6, 1.0, 0.5, limit * 1.0001, 54.4e-6, 0.52, TABLE1.beta, 1.41, 5e-9).exists
     assert table1(gap={"mu": limit * (1.0 - 1e-12)})["Xgap"].values["mu"] < limit
     with pytest.raises(fs.InputError, match=r"Xgap has no contact: .*A0\^2 > c2 mu\^2 fn\^2") as caught:
         table1(gap={"mu": limit * (1.0 + 1e-12)})

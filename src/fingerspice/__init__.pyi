@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from fingerspice.base.errors import FingerspiceWarning as FingerspiceWarning
     from fingerspice.base.errors import InputError as InputError
     from fingerspice.circuit.circuit import Circuit as Circuit
+    from fingerspice.circuit.laws import ContactLaw as ContactLaw
     from fingerspice.explorer.server import Explorer as Explorer
     from fingerspice.explorer.server import explore as explore
     from fingerspice.netlist.netlist import parse_netlist as parse_netlist

@@ -12,19 +12,20 @@ from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 from fingerspice.base.arrays import Remembering, real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.pages import Page, Shown
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.devices import DEVICES, DeviceSpec, check, concerns, mega_note, unit_trap, unusual_of_changed
+from fingerspice.circuit.laws import ContactLaw, law_of
 from fingerspice.waveforms.waveform import Waveform, as_waveform, refuse, require
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
 #: A value in the netlist's unit, as a number or text, or a source's waveform or function of time (s); by path.
-Changes = Mapping[str, float | str | Waveform | Callable[[float], float]]
+Changes = Mapping[str, float | str | Waveform | ContactLaw | Callable[[float], float]]
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class Element(Remembering):
     initial: float | None = None  # ``IC=`` of a capacitor, V
     where: Where | None = None  # Place in the netlist
     ac: SmallSignal | None = None  # Of a source that has one
+    law: ContactLaw | None = None  # Of a GAP with another one than the paper's
 
     def __repr__(self) -> str:
         from fingerspice.circuit.describe import values_text
@@ -71,8 +73,14 @@ class Element(Remembering):
 
     @property
     def spec(self) -> DeviceSpec:
-        """The device's entry in the registry."""
-        return DEVICES[self.device]
+        """The device's entry in the registry, or that of a GAP with its contact law."""
+        return DEVICES[self.device] if self.law is None else self.law.spec
+
+    def under(self, law: ContactLaw | None) -> Element:
+        """This GAP with a contact law: with its values of parameters that both laws have, and the others' defaults."""
+        other = dataclasses.replace(self, law=law)
+        values = {p.name: self.values.get(p.name, p.default or 0.0) for p in other.spec.parameters}
+        return dataclasses.replace(other, values=MappingProxyType(values))
 
     @cached_property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -257,21 +265,25 @@ class Circuit(Remembering, Shown):
             raise InputError(f"replace is given {changes!r}; allowed: a mapping such as {{'Xgap.d': 3e-6}}")
         elements = {e.name.lower(): e for e in self.elements}
         overrides, traps = dict(self.overrides), dict[str, str]()
-        for path, value in changes.items():
+        # A contact law has parameters that other changes may be about.
+        for path, value in sorted(changes.items(), key=lambda one: not one[0].lower().endswith(".law")):
             key = path.lower()
             name, _, parameter = key.rpartition(".")
             if key in elements and elements[key].device in "VI":
                 from fingerspice.netlist.netlist import source_from_text
 
-                waveform = source_from_text(value, self) if isinstance(value, str) else as_waveform(value)
+                waveform = source_from_text(value, self) if isinstance(value, str) else as_waveform(cast(Any, value))
                 # The AC magnitude belonged to the source that is replaced.
                 elements[key] = dataclasses.replace(elements[key], waveform=waveform, ac=None)
+            elif name in elements and parameter == "law" and elements[name].device == "GAP":
+                elements[name] = elements[name].under(law_of(value))
             elif name in elements:
                 elements[name], trap = _changed(elements[name], parameter, value, path)
                 traps |= {key: trap} if trap else {}
             else:
                 raise InputError(self._unknown_path(path))
-            overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", str(value))
+            named = getattr(value, "__name__", str(value)) if not isinstance(value, ContactLaw) else value.name
+            overrides[path] = value if isinstance(value, str) else named
         changed = self._with(elements=tuple(elements.values()), overrides=overrides)
         check(changed)
         before, after = unusual_of_changed(self, changed)

@@ -62,6 +62,7 @@ def digests(circuit: Circuit) -> tuple[str, str]:
     for element in circuit.elements:
         wave = element.waveform
         elements.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
+        elements.update((element.law.name if element.law else "").encode())
         sources.update(repr((element.name, wave.digest() if isinstance(wave, Samples) else wave)).encode())
     elements.update(repr((dict(circuit.initial), tran and (tran.max_step, tran.uic))).encode())
     return elements.hexdigest(), sources.hexdigest()
@@ -163,7 +164,7 @@ def circuit_page(circuit: Circuit) -> Page:
 
 def values_text(element: Element) -> str:
     """Values of an element in the units of the netlist, without those that are infinite, and its waveform."""
-    said = []
+    said = [] if element.law is None else [f"law={element.law.name}"]
     for name, value in element.values.items():
         text = f"{value:.4g}" if 0.01 <= abs(value) < 1e4 else format_si(value, "").replace(" ", "").replace("M", "meg")
         said += [f"{name}={text}"] if math.isfinite(value) else []

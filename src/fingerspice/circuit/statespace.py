@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, Remembering, T
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.physics.contact import Contact
+from fingerspice.physics.contact import Contact, JkrContact
 from fingerspice.physics.materials import EPS0, SKIN_LADDER
 from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, refuse
 
@@ -368,15 +368,23 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
     return layer.remember(("cells", skin_at), lambda: cells(layer.values, skin_at))
 
 
+#: Units of contacts in mm, over those in m; that of beta, mm^(2 - n), depends on another parameter.
+_IN_MM = {"mm^2": 1e-6, "mm^2/N": 1e-6, "mm^2/N^m": 1e-6, "mm^4/N^2": 1e-12}
+
+
 def contact_of(gap: Element) -> Contact:
     """The contact of a GAP; here, and nowhere else, the paper's mm are converted to m."""
 
     def make() -> Contact:
-        v = gap.values
         # A product may overflow, or a logarithm be taken of one that underflows.
         with suppress(ArithmeticError, ValueError):
-            alpha, beta, c2 = v["alpha"] * 1e-6, v["beta"] * 1e-6 * 1e3 ** v["n_exp"], v["c2"] * 1e-12
-            contact = Contact(v["d"], v["eps_r"], v["fn"], v["mu"], alpha, v["m_exp"], beta, v["n_exp"], c2)
+            v = {p.name: gap.values[p.name] * _IN_MM.get(p.unit, 1.0) for p in gap.spec.parameters}
+            if "beta" in v:
+                v["beta"] *= 1e-6 * 1e3 ** v.get("n_exp", 0.0)
+            if gap.law is not None:
+                return gap.law.contact(v)
+            names = ("d", "eps_r", "fn", "mu", "alpha", "m_exp", "beta", "n_exp", "c2")
+            contact = JkrContact(*(v[name] for name in names))
             if np.all(np.isfinite(contact.packed)):
                 return contact
         what = f"{gap.name} has a contact whose constants are beyond the range of numbers"
@@ -404,6 +412,9 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
             contact, gap_layer = contact_of(area.gap), layers.index(area.gap)
             gap = sum(cells[:gap_layer])
             if circuit.work == "total":
+                if not isinstance(contact, JkrContact):
+                    needed = f"work=total (Eq. 7) needs the paper's contact law, and {area.gap.name} has another"
+                    raise InputError(f"{needed}; allowed: law=jkr, or work=gap", area.gap.where)
                 d = np.repeat([e.values["d"] for e in layers], cells)
                 contact = contact.with_total_voltage_held(d, c * d / EPS0)
         sign = np.repeat([hop.sign for hop in along], cells)

@@ -15,6 +15,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.units import exponent_and_scale, format_si
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element, Tran
 from fingerspice.circuit.devices import DEVICES, REST_AREA, ParameterSpec, mega_note, unit_trap, unusual
+from fingerspice.circuit.laws import ContactLaw, law_of
 from fingerspice.circuit.network import checked
 from fingerspice.netlist.deck import parse_deck, with_comma
 from fingerspice.netlist.expressions import Call, Number, Token, Value, number
@@ -161,7 +162,9 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
     elif device in "RC":
         values, read["initial"] = _read_passive(own, notes)
     else:
-        values = _device_values(own, notes)
+        if device == "GAP" and "law" in own.params:
+            read["law"] = _law(own)
+        values = _device_values(own, read.get("law"), notes)
     element = Element(name, device, nodes, names, MappingProxyType(values), where=where, **read)
     for parameter, text in unusual(element):
         given = statement.body[0] if parameter == "value" and statement.body else params.get(parameter)
@@ -183,15 +186,27 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
     return out
 
 
-def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
+def _law(statement: Statement) -> ContactLaw | None:
+    given = statement.params.pop("law")
+    try:
+        return law_of(given.text)
+    except InputError as error:
+        raise InputError(f"{statement.name}: {error.message}", given.where) from None
+
+
+def _device_values(statement: Statement, law: ContactLaw | None, notes: list[str]) -> dict[str, float]:
     name, device, params, where = statement.name, statement.device, statement.params, statement.where
     refuse(statement.nodes[2] == "0", f"{name} has ground as its area; allowed: the area node of a GAP", where)
-    known = {p.name: p for p in DEVICES[device].parameters}
+    known = {p.name: p for p in (DEVICES[device] if law is None else law.spec).parameters}
+    under = "" if law is None else f" with law={law.name}"
     for key, given in params.items():
         if key not in known:
             # On an X line m=... is ngspice's number of copies.
             hint = "; the exponent is m_exp" if key == _COPIES and "m_exp" in known else nearest(key, known)
-            raise InputError(f"{name}: {device} has no parameter {key!r}{hint}; allowed: {', '.join(known)}", given.key)
+            said = f"{name}: {device}{under} has no parameter {key!r}{hint}"
+            raise InputError(
+                f"{said}; allowed: {', '.join([*known, *(['law'] if device == 'GAP' else [])])}", given.key
+            )
     values = {}
     for key, spec in known.items():
         if key in params:

@@ -11,26 +11,31 @@ All functions take and return SI units.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, read_only
+from fingerspice.base.arrays import FloatArray, read_only, real_numbers
 from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.base.errors import InputError
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.materials import EPS0
 
 N_PACKED = 8
 """Length of the parameter vector that the compiled functions take."""
-# Terms that a curve may have, and its error, relative.
-_SIZES, _ERROR = (32, 48), 2e-15
+# Terms that a curve may have, and its error, relative; errors and terms of a rough function's.
+_SIZES, _ERROR, _ROUGH = (32, 48), 2e-15, ((1e-12, (96, 192)), (1e-9, (384, 768)), (1e-6, (768,)))
+# How far below 0 V the curve of an even function reaches, and where a curve ends before the end of the areas: both over
+# the largest voltage.
+_EVEN, _BEFORE_END = 0.3, (0.999, 0.99, 0.95)
 
 
 @dataclass(frozen=True)
 class Contact:
-    """A fingerpad pressed on a screen across an air gap, in full slip (Table 1).
+    """A fingerpad pressed on a screen across an air gap, in full slip: what all contact laws have.
 
     Parameters
     ----------
@@ -42,6 +47,48 @@ class Contact:
         Applied normal force, N.
     mu : float
         Friction coefficient.
+    """
+
+    d: float
+    eps_r: float
+    f_n: float
+    mu: float
+
+    @cached_property
+    def packed(self) -> FloatArray:
+        """Parameters as the compiled functions take them, shape (8,): those of an area that is always that at 0 V."""
+        return np.array([0.0, self.area_at_rest, 1.0, *np.zeros(N_PACKED - 3)])
+
+    @cached_property
+    def area_at_rest(self) -> float:
+        """Ridge contact area without voltage, m^2."""
+        return float(self.area(0.0))
+
+    def area(self, u_gap: ArrayLike) -> FloatArray:
+        """Ridge contact area in full slip, A_R, m^2, at gap voltage `u_gap` (V)."""
+        raise NotImplementedError
+
+    def stress(self, u_gap: ArrayLike) -> FloatArray:
+        """Electroadhesive stress sigma_el (Eq. 2), Pa, at gap voltage `u_gap` (V)."""
+        return np.asarray(0.5 * EPS0 * self.eps_r / self.d**2 * np.asarray(u_gap, float) ** 2)
+
+    def curve(self, u_max: float) -> FloatArray:
+        """1/A_R as one Chebyshev series over |u_gap| <= `u_max` (V), for `inverse_area`.
+
+        The series reaches a little past the kink at 0 V on its analytic continuation, so that a step across the kink
+        stays smooth.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class JkrContact(Contact):
+    """The paper's contact (Eqs. 1 to 7, Table 1).
+
+    Parameters
+    ----------
+    d, eps_r, f_n, mu
+        As of a `Contact`.
     alpha, m : float
         Ridge area against normal force, A = alpha F^m (Eq. 5); alpha in m^2/N^m.
     beta, n : float
@@ -53,10 +100,6 @@ class Contact:
         with the total voltage held.
     """
 
-    d: float
-    eps_r: float
-    f_n: float
-    mu: float
     alpha: float
     m: float
     beta: float
@@ -73,11 +116,6 @@ class Contact:
     def exists(self) -> bool:
         """Whether friction leaves an area at 0 V: A0^2 > c2 mu^2 F_N^2."""
         return self.area_unloaded**2 > self.c2 * (self.mu * self.f_n) ** 2
-
-    @cached_property
-    def area_at_rest(self) -> float:
-        """Ridge contact area without voltage, m^2."""
-        return float(ridge_area(0.0, self.packed))
 
     @cached_property
     def packed(self) -> FloatArray:
@@ -109,26 +147,114 @@ class Contact:
         x = packed[0] * np.abs(np.asarray(u_gap, float))
         return packed[1] * universal_curve_array(x.ravel(), packed[2], packed[3]).reshape(x.shape)  # type: ignore[no-any-return]
 
-    def stress(self, u_gap: ArrayLike) -> FloatArray:
-        """Electroadhesive stress sigma_el (Eq. 2), Pa, at gap voltage `u_gap` (V)."""
-        return np.asarray(0.5 * EPS0 * self.eps_r / self.d**2 * np.asarray(u_gap, float) ** 2)
-
-    def with_total_voltage_held(self, d: ArrayLike, eps_r: ArrayLike) -> Contact:
+    def with_total_voltage_held(self, d: ArrayLike, eps_r: ArrayLike) -> JkrContact:
         """The same contact with w at total voltage held (Eq. 7, capacitive stack of layers d, eps_r)."""
         thickness = float(np.sum(np.asarray(d, float) / np.asarray(eps_r, float)))
         return replace(self, work_ratio=thickness / (self.d / self.eps_r))
 
     def curve(self, u_max: float) -> FloatArray:
-        """1/A_R as one Chebyshev series over |u_gap| <= `u_max` (V), for `inverse_area`.
-
-        The series reaches a little past the kink at 0 V on its analytic continuation, so that a step across
-        the kink stays smooth. Where no short series reaches rounding, the exact solution is used instead.
-        """
+        """As of a `Contact`; without a short series that reaches rounding the exact solution is used instead."""
         # The continuation exists while 1 + x y^p > 0; x = -0.2 is well inside for every legal exponent pair.
         lo, packed = -min(0.3 * u_max, 0.2 / float(self.packed[0])), self.packed
         with np.errstate(all="ignore"):
             series = chebyshev.fit(lambda u: 1.0 / ridge_area_array(u, packed), lo, u_max, _ERROR, _SIZES)
         return np.concatenate([[lo, u_max], packed, () if series is None else series])
+
+
+@dataclass(frozen=True)
+class LawContact(Contact):
+    """A contact whose area is a function of the gap voltage that someone gives.
+
+    Parameters
+    ----------
+    d, eps_r, f_n, mu
+        As of a `Contact`.
+    law : str
+        Name of the function, for messages.
+    function : callable
+        Ridge area, m^2, shape (n,), at gap voltages of 0 V or more, shape (n,), and with `values`.
+    values : mapping
+        Its parameters by name.
+    """
+
+    law: str
+    function: Callable[[FloatArray, Mapping[str, float]], ArrayLike]
+    values: Mapping[str, float]
+
+    def _given(self, u: FloatArray) -> FloatArray:
+        """The function's areas at gap voltages of 0 V or more, (n,); NaN for those that are no positive number."""
+        with np.errstate(all="ignore"):
+            area = real_numbers(
+                f"the area of the contact law {self.law}", self.function(u, self.values), "real numbers"
+            )
+        if area.shape != u.shape:
+            said = f"the contact law {self.law} gives areas of shape {area.shape} at {u.size} gap voltages"
+            raise InputError(f"{said}; allowed: one for each of the voltages (n,), in m^2")
+        return np.where((area > 0.0) & (area < math.inf), area, math.nan)
+
+    def area(self, u_gap: ArrayLike) -> FloatArray:
+        """Ridge contact area, m^2, at gap voltage `u_gap` (V).
+
+        Raises
+        ------
+        InputError
+            Where the function's area is no positive number.
+        """
+        u = np.abs(np.asarray(u_gap, float))
+        area = self._given(u.ravel()).reshape(u.shape)
+        if np.isnan(area).any():
+            raise InputError(self.ends(float(u[np.isnan(area)].min())))
+        return area
+
+    def ends(self, u: float) -> str:
+        """The message about a gap voltage (V) at which there is no area."""
+        said = f"the contact law {self.law} has no area above 0 at {u:.4g} V across the gap"
+        return f"{said}; allowed: a smaller source, or a law that reaches further"
+
+    def reach(self, u_max: float) -> float:
+        """The gap voltage (V) up to which there is an area, at most `u_max`."""
+        u = np.linspace(0.0, u_max, 65)
+        none = np.flatnonzero(np.isnan(self._given(u)))
+        if not none.size:
+            return u_max
+        low, high = u[max(none[0] - 1, 0)], u[none[0]]
+        while low < (middle := 0.5 * (low + high)) < high:
+            low, high = (low, middle) if np.isnan(self._given(np.array([middle]))[0]) else (middle, high)
+        return float(low)
+
+    def curve(self, u_max: float) -> FloatArray:
+        """As of a `Contact`, as far as there are areas; of a rough function as exact as 768 terms make it.
+
+        Raises
+        ------
+        InputError
+            If these do not give 1e-6 of the area, and without an area at 0 V.
+        """
+        reach = self.reach(u_max)
+        # Where the areas end, their slope may have none: the curve then ends a little before.
+        shares = _BEFORE_END if reach < u_max else (1.0,)
+        for error, sizes in ((_ERROR, _SIZES), *_ROUGH):
+            for share in shares:
+                hi = share * reach
+                # An even function is its own continuation.
+                for lo in (-_EVEN * hi, 0.0):
+                    series = chebyshev.fit(lambda u: 1.0 / self.area(u), lo, hi, error, sizes)
+                    if series is not None:
+                        return _continued(lo, hi, series, self.packed)
+        said = (
+            f"the contact law {self.law} is too rough up to {reach:.4g} V: {sizes[-1]} terms miss it by over {error:g}"
+        )
+        raise InputError(f"{said}; allowed: areas without jumps")
+
+
+def _continued(lo: float, hi: float, series: FloatArray, packed: FloatArray) -> FloatArray:
+    """A curve of a series; one that begins at 0 V is the same polynomial from a little below on."""
+    if lo == 0.0:
+        # There a term of degree n grows within 1/n^2 of the range.
+        lo = -min(_EVEN, 1.0 / series.size**2) * hi
+        at = 2.0 * chebyshev.nodes(series.size, lo, hi) / hi - 1.0
+        series = chebyshev.coefficients(np.asarray(np.polynomial.chebyshev.chebval(at, series), float))
+    return np.concatenate([[lo, hi], packed, series])
 
 
 def fixed_area_curve(area: float) -> FloatArray:

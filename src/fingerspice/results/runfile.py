@@ -14,7 +14,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -28,6 +28,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import UNFINISHED, settle_on_disk, write_pieces
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran
+from fingerspice.circuit.laws import ContactLaw, law_of
 from fingerspice.circuit.network import checked
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.physics.contact import Contact
@@ -198,6 +199,7 @@ _WAVEFORMS = {
         periodic.Repeat, samples.Samples,
     )
 }  # fmt: skip
+_OF_CONTACT = ("d", "eps_r", "f_n", "mu")  # What the signals of a run need of a contact
 _LEFT_OUT = ("where", "text", "path")  # Attributes of a circuit and its elements that a file does not hold here
 
 
@@ -251,7 +253,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             run = {"format": FORMAT, **{name: plain(getattr(solution, name)) for name, (plain, _) in _PLAIN.items()}}
             run |= {
                 "sources": list(solution.sources), "signals": list(solution.signals),
-                "contacts": [[name, asdict(contact)] for name, contact in solution.record.fingers],
+                "contacts": [[name, _of_contact(contact)] for name, contact in solution.record.fingers],
                 "overrides": dict(solution.circuit.overrides), "summary": solution.summary(), "circuit": circuit,
                 "arrays": len(arrays), "between": between and between[0],
             }  # fmt: skip
@@ -271,6 +273,10 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
         write_pieces(target, content.getbuffer())
 
     return files.write_aside(path, write)
+
+
+def _of_contact(contact: Contact) -> dict[str, float]:
+    return {name: getattr(contact, name) for name in _OF_CONTACT}
 
 
 def load(path: str | Path) -> Solution:
@@ -322,7 +328,7 @@ def _solution(file: Any) -> Solution:
     t = table[:, 0].copy()
     if np.any(np.diff(t) < 0.0):
         raise ValueError("its times do not ascend")
-    fingers = tuple((str(name), Contact(**values)) for name, values in run["contacts"])
+    fingers = tuple((str(name), Contact(*(values[k] for k in _OF_CONTACT))) for name, values in run["contacts"])
     sources = tuple(map(str, run["sources"]))
     continuous = None
     if "between" in group.variables:
@@ -379,6 +385,8 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
             name = getattr(getattr(value, "function", None), "__name__", "")
             own = {"kind": "Function", "name": name, "repeat": value.period, "breaks": breaks[breaks < end].tolist()}
             return plain(own | {"edges": table.edges, "series": table.series})
+        if isinstance(value, ContactLaw):
+            return value.name
         if is_dataclass(value):
             names = [f.name for f in fields(value) if f.init and f.name not in _LEFT_OUT]
             return {name: plain(getattr(value, name)) for name in names}
@@ -424,6 +432,7 @@ def made_again(kept: Any, arrays: list[FloatArray]) -> Circuit:
     for one in own["elements"]:
         one["values"] = MappingProxyType({name: float(x) for name, x in one["values"].items()})
         one["ac"] = one["ac"] and SmallSignal(**one["ac"])
+        one["law"] = one.get("law") and law_of(one["law"])
         if not isinstance(one["waveform"], (Waveform, type(None))):
             raise ValueError(f"{one['waveform']!r} is no waveform")
     own["elements"] = tuple(Element(**one) for one in own["elements"])

@@ -14,6 +14,8 @@ from typing import Any, Literal
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray, views_of
+from fingerspice.base.errors import InputError
+from fingerspice.base.units import format_si
 from fingerspice.circuit.network import Modes, Network
 from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
@@ -29,7 +31,7 @@ from fingerspice.engine.one_area.rows import Work, new_stack_work
 from fingerspice.engine.one_area.step import OneArea
 from fingerspice.engine.one_area.system import LEVEL_RATIO, System, area_error, area_missed
 from fingerspice.numerics.lobatto import integral_table
-from fingerspice.physics.contact import inverse_area_range, inverse_areas
+from fingerspice.physics.contact import LawContact, inverse_area_range, inverse_areas
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import sided
 from fingerspice.solve.problem import ROUNDING, Problem, Tables, values_at
@@ -81,7 +83,7 @@ def system_of(
     stress = 0.0 if contact is None else float(contact.stress(1.0))
     u_max, n = u_peak or max(scene.u_peak, u_top), model.gap.size
     nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
-    u_range = inverse_area_range(u_max, 17, model.curve)
+    u_range = inverse_area_range(min(u_max, float(model.curve[1])), 17, model.curve)
     grouping = scene.shown.turn[:, None] * scene.network.stack.grouping
     return systems.build_system(model, area_error(decade), u_range, grouping, nodes, stress, ratio)
 
@@ -127,7 +129,10 @@ class Track(Stepping):
 
     def failed(self, code: int, sources: Sources) -> Status:
         if code == readout.OUT_OF_RANGE:
-            raise OutOfRangeError(self.system.u_top)
+            (contact,), u_top = self.problem.network.contacts, self.system.u_top
+            if isinstance(contact, LawContact) and contact.curve(1.1 * u_top)[1] <= u_top:
+                raise InputError(f"at {format_si(self.t, 's')} {contact.ends(u_top)}")
+            raise OutOfRangeError(u_top)
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
             (self.control["u_before"],), _ = values_at(sources, self.t, "left")

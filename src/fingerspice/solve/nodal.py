@@ -25,6 +25,7 @@ from fingerspice.engine import implicit
 from fingerspice.engine.implicit import Nodal, advance, new_work
 from fingerspice.engine.network import Sources, new_room, ramp, rates_at
 from fingerspice.numerics.lobatto import Scheme, radau_scheme
+from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
 from fingerspice.solve import runs
 from fingerspice.solve.problem import ROUNDING, Problem, Tables, segment_index, values_at
@@ -67,7 +68,8 @@ class Collocation(Integration):
         for i, contact in enumerate(problem.network.contacts):
             if contact is not None and self.net.gap[i] >= 0:
                 # Where voltage presses an area away, its charge moves at voltages that are a small part of the peak.
-                least[i] = min(least[i], max(float(contact.area(u_scale)), LEAST_SHARE * least[i]))
+                pressed = 1.0 / inverse_area(u_scale, self.net.curves[i])[0]
+                least[i] = min(least[i], max(pressed, LEAST_SHARE * least[i]))
         stored = u_scale * float(np.abs(problem.network.capacitance(least)).sum()) or u_scale
         # With an infinite scale the error of the charge does not control the steps, unless charge was asked for.
         charge, sizes = stored if problem.charge else np.inf, [self.n, self.n_slow, self.s_before.size]

@@ -15,7 +15,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import circuit_warnings, course_warnings, spectrum_warning
 from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.statespace import driving
-from fingerspice.physics.contact import inverse_area, inverse_area_range
+from fingerspice.physics.contact import LawContact, inverse_area, inverse_area_range
 from fingerspice.results.outcome import Plan, Status
 from fingerspice.results.record import Record
 from fingerspice.solve.periodic import close_period
@@ -173,6 +173,8 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
             area = record.each("area")[finger]
             least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
         elif net.gap[i] >= 0:
+            if isinstance(contact, LawContact) and u_peak > net.curves[i, 1]:
+                raise InputError(contact.ends(u_peak))
             least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
             largest = max(unloaded, least)
         if u_peak > BREAKDOWN_VOLTAGE:

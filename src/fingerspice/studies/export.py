@@ -15,7 +15,7 @@ from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import find_branches
 from fingerspice.netlist.reader import LIBRARIES, library_text
-from fingerspice.physics.contact import Contact
+from fingerspice.physics.contact import Contact, JkrContact, LawContact
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
 from fingerspice.waveforms.periodic import PWL, Pulse
@@ -36,6 +36,8 @@ _OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
 # Points per shortest time scale of a waveform: between them, a sine is off by 5e-6 of its amplitude. Most points of a
 # source, and how many are few.
 _DENSITY, _MOST, _FEW = 1000, 2_000_000, 1000
+# Error of the areas of another contact law than the paper's, relative; parameters of a GAP beside such a table.
+_OF_TABLE, _OF_TABLES = 1e-6, ("d", "eps_r", "r", "a_fix", "tau")
 
 
 def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
@@ -68,7 +70,7 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     pairs = zip(network.areas, network.contacts, strict=True)
     contacts = {area.node: contact for area, contact in pairs if contact is not None}
     areas = _start_areas(circuit, law, contacts)
-    ratio = max((contact.work_ratio for contact in contacts.values()), default=1.0)
+    ratio = max((one.work_ratio for one in contacts.values() if isinstance(one, JkrContact)), default=1.0)
     lines = [circuit.title or "fingerspice export"]
     lines.append(f"* Written by fingerspice; charge law {law}. Run: ngspice -b -r out.raw FILE")
     if circuit.overrides:
@@ -83,8 +85,32 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     if (ac := circuit.ac) is not None:
         lines.append(f".ac {ac.scale} {ac.points} {ac.start!r} {ac.stop!r}")
     lines += _start_lines(circuit, areas, contacts)
-    lines += ["", library_text(law).rstrip(), "", _OPTIONS, ".end", ""]
+    lines += ["", library_text(law).rstrip(), ""]
+    top = prepare(circuit, charge_law=law, charge=False).scene.u_top if any(e.law for e in circuit.elements) else 0.0
+    for gap in circuit.by_device("GAP"):
+        contact = contacts[gap.nodes[2]]
+        if isinstance(contact, LawContact):
+            lines += _table(_element_name(gap), contact, contact.reach(top))
+    lines += [_OPTIONS, ".end", ""]
     return "\n".join(lines)
+
+
+def _table(name: str, contact: LawContact, reach: float) -> list[str]:
+    """A GAP's subcircuit of its own, in which the areas stand as points up to a gap voltage (V)."""
+    for count in 2 ** np.arange(6, 13) + 1:
+        u = np.linspace(0.0, reach, count)
+        area = contact.area(u)
+        # A line between every other point, where the left-out ones are known.
+        if np.abs(0.5 * (area[:-2:2] + area[2::2]) / area[1::2] - 1.0).max() <= 4.0 * _OF_TABLE:
+            break
+    points = ", ".join(f"{x!r}, {y!r}" for x, y in zip(u.tolist(), (1e6 * area).tolist(), strict=True))
+    wrapped = textwrap.wrap(
+        f"Ba follow 0 V=a_fix > 0 ? a_fix : pwl(abs(V(p,n)), {points})", 100, subsequent_indent="+ "
+    )
+    head = f"* GAP with the contact law {contact.law}: its areas up to {reach:.4g} V, on straight lines between points."
+    begin = f".subckt GAP_{name} p n area params: d=1u eps_r=1 r=inf a_fix=0 tau=0 ic=0 a_ic=0"
+    layer = "Xg p n area LAYER d={d} eps_r={eps_r} r={r} ic={ic} a_ic={a_ic}"
+    return [head, begin, layer, *wrapped, "Ra follow area 1", "Ca area 0 {a_fix > 0 ? 0 : tau}", ".ends", ""]
 
 
 def _name(name: str) -> str:
@@ -137,6 +163,8 @@ def _start_lines(circuit: Circuit, areas: Mapping[str, float], contacts: Mapping
         yield f"{'.nodeset' if held is None else '.ic'} v({written[node]})={guess if held is None else held!r}"
         if areas and circuit.initial and not gap.values["a_fix"]:
             # Without guesses for the nodes inside a GAP, ngspice's first Newton iteration fails at u != 0.
+            if not isinstance(contact, JkrContact):
+                continue
             u, name = start_voltage(gap, circuit.initial), _element_name(gap)
             y = float(contact.area_adhesive(u)) / (at_rest := float(contact.area_adhesive(0.0)))
             pull, area = float(contact.stress(u)) * at_rest / contact.f_n, 1e6 * float(contact.area(u))
@@ -153,13 +181,15 @@ def _element_line(element: Element, circuit: Circuit, work_ratio: float, start_a
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
         return f"{head} {element.values['value']!r}{initial}"
     # e_max is left out: it only serves a warning of this package.
-    numbers = {k: "1e30" if math.isinf(v) else repr(float(v)) for k, v in element.values.items() if k != "e_max"}
+    written = [k for k in element.values if k != "e_max" and (element.law is None or k in _OF_TABLES)]
+    numbers = {k: "1e30" if math.isinf(v := element.values[k]) else repr(float(v)) for k in written}
     values = " ".join(f"{k}={number}" for k, number in numbers.items())
     extra = f" wk={work_ratio!r}" if element.device == "GAP" and work_ratio != 1.0 else ""
     area = start_areas.get(element.nodes[2])
     held = 0.0 if area is None else start_voltage(element, circuit.initial)
     extra += f" ic={held!r} a_ic={area!r}" if held else ""
-    return f"{head} {element.device} {values}{extra}"
+    device = element.device if element.law is None else f"GAP_{_element_name(element)}"
+    return f"{head} {device} {values}{extra}"
 
 
 def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:

@@ -112,6 +112,8 @@ def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str
     stack, tran = build_stack(circuit), circuit.tran
     if stack.contact is None or stack.gap is None or stack.gap_layer is None or stack.area_given is not None:
         return "the stack has no contact whose area follows the gap"
+    if stack.layers[stack.gap_layer].law is not None:
+        return "the contact law is not the paper's"
     if not {e.device for e in stack.layers} <= set(_LAYERS) or not 2 <= len(stack.layers) <= _MOST_LAYERS:
         return f"the stack has other layers than {', '.join(_LAYERS)}, or not 2 to {_MOST_LAYERS} of them"
     if (circuit.charge_law or "local") != "local" or circuit.work != "gap":

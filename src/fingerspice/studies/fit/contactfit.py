@@ -19,7 +19,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.circuit.statespace import build_stack, contact_of, loop_of
-from fingerspice.physics.contact import Contact, ridge_area
+from fingerspice.physics.contact import JkrContact, ridge_area
 from fingerspice.studies.fit.fitting import NOT_FOUND, SIGMA, FitResult, Fitted, Given, Problem, followed, measured_of
 from fingerspice.waveforms.waveform import refuse, require
 
@@ -59,7 +59,7 @@ class Relation(NamedTuple):
         """What was measured, in words."""
         return NAMES[self.kind]
 
-    def predicted(self, contact: Contact) -> FloatArray:
+    def predicted(self, contact: JkrContact) -> FloatArray:
         """The values as a contact has them (Eqs. 1 to 6), shape (n,)."""
         if self.kind == "indentation":
             return np.asarray(contact.beta * self.indentation**contact.n)
@@ -133,6 +133,7 @@ class Task(Problem):
         changed = self.circuit.varied(dict(zip(self.names, values.tolist(), strict=True)))
         own = build_stack(changed).contact if loop_of(changed) else None
         contact = contact_of(changed[self.gap]) if own is None else own
+        assert isinstance(contact, JkrContact)
         return [relation.predicted(contact) for relation in self.relations]
 
     def misses(self, values: FloatArray) -> FloatArray:
@@ -334,6 +335,8 @@ def _gap(circuit: Circuit, finger: str | None) -> str:
     refuse(several, f"this circuit has several GAPs; allowed: finger= one of {known}")
     name = next(iter(gaps.values())) if finger is None else gaps.get(finger.lower(), "")
     require(bool(name), "finger", repr(finger), f"the name of a GAP, {known}")
+    law = circuit[name].law
+    require(law is None, f"{name}.law", repr(law and law.name), "'jkr', whose parameters are fitted here")
     fixed = circuit[name].values["a_fix"]
     require(fixed == 0.0, f"{name}.a_fix", f"{fixed:g} mm^2", "0, as a given area follows no contact")
     return name

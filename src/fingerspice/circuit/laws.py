@@ -1,0 +1,118 @@
+"""Contact laws: each gives the ridge area at a gap voltage, and has parameters of its own beside those of every GAP."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fingerspice.base.arrays import FloatArray, Remembering, real_number, real_numbers
+from fingerspice.circuit.devices import DEVICES, OF_EVERY_LAW, DeviceSpec, ParameterSpec
+from fingerspice.physics import laws
+from fingerspice.physics.contact import LawContact
+from fingerspice.waveforms.waveform import refuse, require
+
+#: Name of the paper's law, which a GAP has by default; and every other law by its name.
+PAPER, LAWS = "jkr", dict[str, "ContactLaw"]()
+
+
+@dataclass(frozen=True, eq=False)
+class ContactLaw(Remembering):
+    """A relation between gap voltage and ridge contact area, for ``law=`` of a GAP (docs/howto/contact-law.md).
+
+    Decks that are read after it was made find it by its name. The area is independent of the charge law; of results,
+    only the area itself depends on the law: friction is mu (F_N + F_el).
+
+    Parameters
+    ----------
+    name : str
+    area : callable
+        ``area(u, p)``: ridge area, m^2, shape (n,), at gap voltages `u` of 0 V or more, shape (n,). The mapping `p` has
+        `d` (m), `eps_r`, `fn` (N) and `mu` of the GAP, and the law's own parameters. The areas may end at a voltage:
+        NaN, 0 or less stands for none.
+    parameters : mapping of str to float, optional
+        Own parameters with their defaults. Those of the paper's law (alpha, m_exp, beta, n_exp, c2) keep their units in
+        decks, and are in SI units in `p`.
+
+    Raises
+    ------
+    InputError
+        For a name that is no word or that of a law of this package, an area that is no function, or a parameter that
+        has the name of a parameter of every GAP or no number.
+    """
+
+    name: str
+    area: Callable[[FloatArray, Mapping[str, float]], ArrayLike]
+    parameters: Mapping[str, float | ParameterSpec] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        what, name = f"contact law {self.name}", str(self.name).lower()
+        allowed = f"a word but {', '.join(_OWN)}"
+        require(name.isidentifier() and name not in _OWN, "contact law", repr(self.name), allowed)
+        require(callable(self.area), f"the area of {what}", repr(self.area), "a function area(u, p)")
+        for own, default in self.parameters.items():
+            if not isinstance(default, ParameterSpec):
+                real_number(f"{what}: {own}", default, "a number")
+            known = own.isidentifier() and own.islower() and own not in (*OF_EVERY_LAW, "law")
+            require(known, f"a parameter of {what}", repr(own), f"a word in lower case but {', '.join(OF_EVERY_LAW)}")
+        LAWS[name] = self
+
+    @classmethod
+    def from_table(cls, name: str, u_gap: ArrayLike, area: ArrayLike) -> ContactLaw:
+        """The law of measured areas (m^2) at ascending gap voltages (V) from 0 V on, both of shape (n,).
+
+        Between them it is a monotone cubic (Fritsch and Carlson 1980), and beyond the last one there is no area.
+
+        Raises
+        ------
+        InputError
+            For fewer than 3 values, voltages that do not ascend from 0 V, or areas that are not positive.
+        """
+        from scipy.interpolate import PchipInterpolator
+
+        what, allowed = f"contact law {name}", "numbers, shape (n,)"
+        u, areas = real_numbers(f"{what}: u_gap", u_gap, allowed), real_numbers(f"{what}: area", area, allowed)
+        shapes = f"{what} has u_gap of shape {u.shape} and area of shape {areas.shape}"
+        refuse(u.ndim != 1 or u.shape != areas.shape or u.size < 3, f"{shapes}; allowed: two rows of 3 or more")
+        single = f"{what} is no function: its gap voltages have to ascend from 0 V, each of them once"
+        refuse(u[0] != 0.0 or not np.all(np.diff(u) > 0.0), single)
+        refuse(not np.all((areas > 0.0) & (areas < np.inf)), f"{what} has an area that is not above 0")
+        table = PchipInterpolator(u, areas, extrapolate=False)
+        return cls(name, lambda u, p: np.asarray(table(u)))
+
+    @cached_property
+    def spec(self) -> DeviceSpec:
+        """The entry of a GAP with this law."""
+        gap = DEVICES["GAP"]
+        known: dict[str, Any] = {p.name: p for p in gap.parameters}
+        any_number = ParameterSpec("", may_be_zero=True, least=-1e30)
+        own = (x if isinstance(x, ParameterSpec) else
+               dataclasses.replace(known.get(name, any_number), name=name, default=float(x))
+               for name, x in self.parameters.items())  # fmt: skip
+        return dataclasses.replace(gap, parameters=(*(known[name] for name in OF_EVERY_LAW), *own))
+
+    def contact(self, v: Mapping[str, float]) -> LawContact:
+        """The contact of a GAP with this law and these values, SI."""
+        own = {name: v[name] for name in ("d", "eps_r", "fn", "mu", *self.parameters)}
+        return LawContact(v["d"], v["eps_r"], v["fn"], v["mu"], self.name, self.area, own)
+
+
+def law_of(given: object) -> ContactLaw | None:
+    """A law, or that of a name; None for the paper's."""
+    if isinstance(given, ContactLaw):
+        return given
+    known = {PAPER: None, **LAWS}
+    require(str(given).lower() in known, "contact law", repr(given), f"{', '.join(known)}, or one made by ContactLaw")
+    return known[str(given).lower()]
+
+
+_OWN: tuple[str, ...] = ()
+ContactLaw("dmt", laws.dmt, {"alpha": 54.4, "m_exp": 0.52})
+_SLOPE = ParameterSpec("slope", "mm^2/N", 72.5, meaning="area per load")
+ContactLaw("linear", laws.linear, {"slope": _SLOPE, "a_max": ParameterSpec("a_max", "mm^2", 100.0, meaning="largest")})
+_OWN = (PAPER, *LAWS)

@@ -1,0 +1,223 @@
+"""Contact laws other than the paper's: a law of one's own, a table and the shipped ones, through every kind of run."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mpmath as mp
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+import analytic as ref
+import fingerspice as fs
+from ngspice_tools import run_ngspice
+from scenes import deck, finger, table1
+
+Areas = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+P = ref.TABLE1
+
+
+def stress(u: Any) -> Any:
+    return 0.5 * P.eps0 * P.eps_a * (u / P.d_a) ** 2
+
+
+def pulled(u: NDArray[np.float64], p: Any) -> NDArray[np.float64]:
+    """A = k (F_N + sigma A), which has no end below the voltage at which k sigma is 1."""
+    return p["k"] * p["fn"] / (1.0 - p["k"] * 0.5 * 8.854e-12 * p["eps_r"] * (u / p["d"]) ** 2)
+
+
+def own_areas(u: Any) -> Any:
+    return 60e-6 * P.force_normal / (1.0 - 60e-6 * stress(u))
+
+
+LAW = fs.ContactLaw("pulled", pulled, {"k": 70e-6})
+OWN = {"Xgap.law": LAW, "Xgap.k": 60e-6}
+
+
+def dmt(u: float) -> float:
+    """N = F_N + sigma alpha N^m, by bisection with 30 digits: alpha N^m, m^2."""
+    with mp.workdps(30):
+        sigma, load = mp.mpf(stress(u)), mp.mpf(P.force_normal)
+        n = mp.findroot(lambda n: n - load - sigma * P.alpha * n**P.m, (load, 100 * load), solver="anderson")
+        return float(P.alpha * n**P.m)
+
+
+def linear(u: float) -> float:
+    with mp.workdps(30):
+        per, sigma = mp.sqrt(mp.pi) / 2 * mp.mpf("72.5e-6") / mp.mpf("100e-6"), mp.mpf(stress(u))
+        force = mp.mpf(P.force_normal)
+        miss = lambda a: mp.mpf("1e-4") * mp.erf(per * (force + sigma * a)) - a  # noqa: E731
+        return float(mp.findroot(miss, (0, 1e-4), solver="anderson"))
+
+
+def reference(areas: Areas, times: NDArray[np.float64], slope: Callable[[float], float], u_start: float = 0.0) -> Any:
+    """Gap voltage of Table 1 at 100 Hz under the local law, from the three layers' equations (Eq. 16) by DOP853."""
+    layers = ref.table1_layers(100.0)
+    c = np.array([x.c for x in layers])
+
+    def rates(t: float, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        a = float(areas(np.array([abs(u[1])]))[0])
+        leaks = u * np.array([1.0 / x.r_total + a / x.r_area for x in layers]) / (c * a)
+        current = (slope(t) + leaks.sum()) / (1.0 / (c * a)).sum()
+        return current / (c * a) - leaks
+
+    run = solve_ivp(rates, (0.0, times[-1]), np.zeros(3), "DOP853", times, rtol=1e-11, atol=1e-10, max_step=5e-5)
+    return run.y[1]
+
+
+def sine_slope(t: float) -> float:
+    return 200.0 * 200.0 * np.pi * np.cos(200.0 * np.pi * t)
+
+
+TIMES = np.linspace(0.0, 0.02, 101)
+
+
+@pytest.mark.parametrize("method", ["auto", "radau"])
+def test_a_law_of_ones_own_runs_a_stack(method: str) -> None:
+    circuit = table1().replace(OWN)
+    solution = fs.simulate(circuit, t_eval=TIMES, rtol=1e-8 if method == "auto" else 1e-6, method=method)
+    expected = reference(own_areas, TIMES, sine_slope)
+    peak = abs(expected).max()
+    assert np.abs(solution.u_gap - expected).max() <= max(solution.error.u_gap, 2e-9 * peak)
+    np.testing.assert_allclose(solution.area, own_areas(solution.u_gap), rtol=1e-12)
+    force = stress(solution.u_gap) * solution.area
+    np.testing.assert_allclose(solution.f_t, P.mu0 * (P.force_normal + force), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("law", "areas"), [("dmt", dmt), ("linear", linear)])
+def test_the_laws_of_the_package_have_the_roots_of_their_equations(law: str, areas: Callable[[float], float]) -> None:
+    circuit = table1(gap={"law": law, "alpha": None, "m_exp": None, "beta": None, "n_exp": None, "c2": None})
+    solution = fs.simulate(circuit, t_eval=TIMES, rtol=1e-8)
+    expected = np.array([areas(abs(u)) for u in solution.u_gap.tolist()])
+    np.testing.assert_allclose(solution.area, expected, rtol=1e-11)
+    found = reference(np.vectorize(areas), TIMES[:11], sine_slope)
+    assert np.abs(solution.u_gap[:11] - found).max() <= max(solution.error.u_gap, 1e-8 * abs(solution.u_gap).max())
+
+
+def test_two_fingers_of_a_network_each_have_their_law() -> None:
+    one = deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0), ".tran 0.2m 20m uic")
+    lines = [*finger("drive", "0", "area1", "1", f=100.0), *finger("drive", "0", "area2", "2", f=100.0)]
+    two = deck("Vdrive drive 0 SIN(0 200 100)", *lines, ".tran 0.2m 20m uic")
+    two = two.replace({"Xgap1.law": LAW, "Xgap1.k": 60e-6, "Xgap2.law": "dmt"})
+    both = fs.simulate(two, t_eval=TIMES, rtol=1e-7)
+    for k, law in enumerate((OWN, {"Xgap.law": "DMT"})):
+        other = fs.simulate(one.replace(law), t_eval=TIMES, rtol=1e-9)
+        assert np.abs(both.u_gap[:, k] - other.u_gap).max() <= both.error.u_gap + other.error.u_gap
+
+
+def test_recordings_batches_sweeps_and_fits_take_a_law(tmp_path: Path) -> None:
+    values = 120.0 * np.sin(np.arange(481) * 0.2) * np.linspace(0.0, 1.0, 481)
+    circuit = table1(f=100.0).replace({**OWN, "Vdrive": fs.Samples(values, 24e3)})
+    run = fs.simulate(circuit, t_stop=0.02, t_eval=TIMES, rtol=1e-6)
+    expected = reference(own_areas, TIMES, lambda t: np.diff(values)[min(int(t * 24e3), 479)] * 24e3)
+    assert np.abs(run.u_gap - expected).max() <= max(run.error.u_gap, 1e-6 * np.abs(expected).max())
+    ks = np.array([50e-6, 60e-6])
+    sine = table1().replace(OWN)
+    single = [fs.simulate(sine.replace({"Xgap.k": k})).f_el_mean for k in ks]
+    batch = fs.batch(sine, {"Xgap.k": ks}, outputs=["f_el_mean"])
+    np.testing.assert_allclose(batch.f_el_mean, single, rtol=1e-4)
+    np.testing.assert_allclose(fs.sweep(sine, {"Xgap.k": ks}, outputs=["f_el_mean"]).f_el_mean, single, rtol=1e-4)
+    frequencies = np.array([30.0, 100.0, 300.0, 1000.0])
+    forces = [fs.steady_state(sine.replace({"Vdrive": fs.Sine(140.0, f)}), rtol=1e-8).f_el_mean for f in frequencies]
+    data = {"frequency": frequencies, "Vdrive.amplitude": np.full(4, 140.0), "f_el_mean": np.array(forces)}
+    fitted = fs.fit(sine.replace({"Xgap.k": 50e-6}), data, ["Xgap.k"], skin="own")
+    assert fitted.values["Xgap.k"] == pytest.approx(60e-6, rel=1e-4)
+    change = fs.simulate(sine, sensitivities=["Xgap.k"], rtol=1e-9).sensitivities["Xgap.k"].f_el_mean
+    steps = [fs.simulate(sine.replace({"Xgap.k": 60e-6 * by}), rtol=1e-9).f_el_mean for by in (0.999, 1.001)]
+    assert change == pytest.approx((steps[1] - steps[0]) / 0.12e-6, rel=1e-5)
+
+
+def test_a_phasors_area_is_that_of_the_rms_voltage() -> None:
+    found = fs.phasor(table1().replace(OWN), [100.0]).area[0]
+    gain = abs(ref.phasor_gains(100.0, found, ref.table1_layers(100.0))[ref.GAP])
+    assert found == pytest.approx(own_areas(200.0 * gain / np.sqrt(2.0)), rel=1e-9)
+
+
+def test_the_export_for_ngspice_has_the_areas_as_points() -> None:
+    circuit = table1(tran="2u 20m 0 2u uic").replace(OWN)
+    text = fs.export_netlist(circuit)
+    assert "GAP with the contact law pulled" in text
+    run = run_ngspice(text, ("v(top)-v(skin)", "v(area)"))
+    ours = fs.simulate(circuit, t_eval=np.clip(run["time"], 0.0, 0.02), rtol=1e-8)
+    assert np.abs(run["v(top)-v(skin)"] - ours.u_gap).max() <= 1e-4 * np.abs(ours.u_gap).max()
+    np.testing.assert_allclose(run["v(area)"], 1e6 * ours.area, rtol=2e-4)
+
+
+def test_a_file_keeps_the_law_and_the_figures(tmp_path: Path) -> None:
+    solution = fs.simulate(table1().replace(OWN))
+    solution.to_netcdf(tmp_path / "run.nc")
+    loaded = fs.load(tmp_path / "run.nc")
+    assert loaded.circuit["Xgap"].law is LAW
+    assert loaded.circuit["Xgap"].values["k"] == 60e-6
+    np.testing.assert_array_equal(loaded.f_t, solution.f_t)
+
+
+def test_a_table_is_a_monotone_cubic_between_its_points() -> None:
+    u = np.array([0.0, 40.0, 90.0, 200.0])
+    areas = np.array([35e-6, 36e-6, 40e-6, 60e-6])
+    law = fs.ContactLaw.from_table("measured", u, areas)
+    solution = fs.simulate(table1().replace({"Xgap.law": law}), t_eval=TIMES)
+    at_points = np.interp(np.abs(solution.u_gap), u, areas)
+    assert np.all((solution.area >= 35e-6 * (1.0 - 1e-6)) & (np.abs(solution.area - at_points) < 2e-6))
+    values = [law.area(np.array([x]), {})[0] for x in u]
+    np.testing.assert_allclose(values, areas, rtol=1e-14)
+
+
+def test_the_papers_law_by_name_changes_nothing() -> None:
+    plain, named = table1(), table1(gap={"law": "jkr"})
+    np.testing.assert_array_equal(fs.simulate(named).u_gap, fs.simulate(plain).u_gap)
+    back = plain.replace({"Xgap.law": "dmt"}).replace({"Xgap.law": "jkr"})
+    assert dict(back["Xgap"].values) == dict(plain["Xgap"].values)
+
+
+SHORT = fs.ContactLaw.from_table("short", [0.0, 20.0, 50.0], [35e-6, 36e-6, 37e-6])
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: table1(gap={"law": "dmd"}), "contact law is 'dmd'; allowed: jkr, dmt, linear"),
+        (lambda: table1(gap={"law": "dmt"}), "GAP with law=dmt has no parameter"),
+        (lambda: table1().replace({"Xgap.law": "tabor"}), "contact law is 'tabor'"),
+        (lambda: table1().replace({"Xgap.law": "dmt", "Xgap.beta": 3.0}), "unknown parameter 'Xgap.beta'"),
+        (lambda: fs.ContactLaw("dmt", pulled), "allowed: a word but jkr, dmt, linear"),
+        (lambda: fs.ContactLaw("own", pulled, {"fn": 1.0}), "a word in lower case but d, eps_r"),
+        (lambda: fs.ContactLaw("own", 3.0), "allowed: a function area(u, p)"),  # type: ignore[arg-type]
+        (lambda: fs.ContactLaw.from_table("t", [0.0, 1.0, 1.0], [1e-6] * 3), "is no function"),
+        (lambda: fs.ContactLaw.from_table("t", [0.0, 1.0, 2.0], [1e-6, 0.0, 1e-6]), "has an area that is not above 0"),
+        (lambda: fs.ContactLaw.from_table("t", [0.0, 1.0], [1e-6] * 2), "allowed: two rows of 3 or more"),
+    ],
+)
+def test_wrong_laws_are_refused(make: Callable[[], Any], said: str) -> None:
+    with pytest.raises(fs.InputError, match=said.replace("(", r"\(").replace(")", r"\)")):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("law", "source", "said"),
+    [
+        (LAW, fs.Sine(300.0, 100.0), r"at 1\.\d+ ms the contact law pulled has no area above 0 at 19\d\.\d V across"),
+        (SHORT, fs.Sine(200.0, 100.0), "the contact law short has no area above 0 at 49.95 V across"),
+        (fs.ContactLaw("none", lambda u, p: np.nan * u), fs.Sine(1.0, 100.0), "no area above 0 at 0 V"),
+        (fs.ContactLaw("minus", lambda u, p: 0.0 * u - 1.0), fs.Sine(1.0, 100.0), "no area above 0 at 0 V"),
+        (fs.ContactLaw("single", lambda u, p: np.array(35e-6)), fs.Sine(1.0, 100.0), r"areas of shape \(\) at 1 gap"),
+        (fs.ContactLaw("jump", lambda u, p: 35e-6 * (1.0 + (u > 50.0))), fs.Sine(200.0, 100.0), "without jumps"),
+    ],
+)
+def test_areas_that_end_or_jump_are_told_with_the_voltage(law: fs.ContactLaw, source: fs.Waveform, said: str) -> None:
+    with pytest.raises(fs.InputError, match=said):
+        fs.simulate(table1().replace({"Xgap.law": law, "Vdrive": source}))
+
+
+def test_areas_that_end_beyond_the_runs_voltages_do_not_matter() -> None:
+    # The source reaches 200 V, and the gap takes less than the 181 V at which the areas of this law end.
+    assert fs.simulate(table1().replace(OWN)).success
+    short = {"Xgap.law": SHORT, "Vdrive": fs.Sine(60.0, 100.0)}
+    lines = [*finger("drive", "0", "area1", "1", f=100.0), *finger("drive", "0", "area2", "2", f=100.0)]
+    two = deck("Vdrive drive 0 SIN(0 60 100)", *lines, ".tran 0.2m 20m uic").replace({"Xgap1.law": SHORT})
+    assert fs.simulate(table1().replace(short)).success
+    assert fs.simulate(two).success
+    with pytest.raises(fs.InputError, match="short has no area above 0 at"):
+        fs.simulate(two.replace({"Vdrive": fs.Sine(200.0, 100.0)}))
