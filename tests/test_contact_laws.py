@@ -123,7 +123,7 @@ def test_recordings_batches_sweeps_and_fits_take_a_law(tmp_path: Path) -> None:
     forces = [fs.steady_state(sine.replace({"Vdrive": fs.Sine(140.0, f)}), rtol=1e-8).f_el_mean for f in frequencies]
     data = {"frequency": frequencies, "Vdrive.amplitude": np.full(4, 140.0), "f_el_mean": np.array(forces)}
     fitted = fs.fit(sine.replace({"Xgap.k": 50e-6}), data, ["Xgap.k"], skin="own")
-    assert fitted.values["Xgap.k"] == pytest.approx(60e-6, rel=1e-4)
+    assert fitted.estimates["Xgap.k"].value == pytest.approx(60e-6, rel=1e-4)
     change = fs.simulate(sine, sensitivities=["Xgap.k"], rtol=1e-9).sensitivities["Xgap.k"].f_el_mean
     steps = [fs.simulate(sine.replace({"Xgap.k": 60e-6 * by}), rtol=1e-9).f_el_mean for by in (0.999, 1.001)]
     assert change == pytest.approx((steps[1] - steps[0]) / 0.12e-6, rel=1e-5)
