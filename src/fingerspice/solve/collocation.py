@@ -304,10 +304,6 @@ class March(Stepping):
         self.rates, self.held, cells = self.form.rates, held(self.form), self.form.c.size
         self.work = new_network_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
 
-    def begin(self, initial: State, tol: float) -> None:
-        super().begin(initial, tol)
-        self.control["magnified"] = 1.0
-
     @property
     def rounding(self) -> list[float]:
         u_peak = self.peaks[:, readout.PEAK_U]

@@ -22,7 +22,7 @@ from fingerspice.results.solution import Solution
 from fingerspice.solve.closed_form import lead_to_fold, run_to_fold, solve_linear
 from fingerspice.solve.collocation import solve as solve_exponential
 from fingerspice.solve.derivatives import check_request, sensitivities_of
-from fingerspice.solve.nodal import solve_coupled, solve_foreign
+from fingerspice.solve.nodal import FOREIGN, solve_coupled, solve_foreign
 from fingerspice.solve.planning import asked, make_plan, run_warnings
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare
 from fingerspice.solve.recordings.run import solve as solve_recording
@@ -30,7 +30,7 @@ from fingerspice.solve.runs import ROUGH, Progress, Run, excess_of, run_failure
 from fingerspice.waveforms.waveform import DOUBLE, require
 
 RTOL_RANGE = (1e-13, 0.1)
-METHODS, LIBRARIES = ("auto", "exponential", "radau"), ("scipy", "torchdiffeq")
+METHODS = ("auto", "exponential", "radau")
 # Statuses of a run by exponential steps after which another method is tried: for a stack, and for a network.
 BEYOND_STACKS = (Status.FOLD, Status.TOO_MANY_STEPS, Status.STEP_UNDERFLOW)
 BEYOND_NETWORKS = (*BEYOND_STACKS, Status.ERROR_NOT_MET)
@@ -153,8 +153,9 @@ def check_arguments(
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
     library, _, name = method.partition(":")
-    if method not in METHODS and not (library in LIBRARIES and name):
-        known = [*METHODS, *(f"{library}:NAME" for library in LIBRARIES)]
+    known = [f"{library}:{one}" for one in FOREIGN.get(library, ()) if name]
+    if method not in (*METHODS, *known):
+        known = known or [*METHODS, *(f"{library}:NAME" for library in FOREIGN)]
         raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
     area_given(area)
     if not (isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)):
@@ -183,10 +184,10 @@ def plan(
     """
     rtol = check_arguments(rtol, area=area)
     circuit = overridden(circuit, sources, parameters)
-    t_stop = real_number("t_stop", t_stop, "a number in s") if t_stop is not None else None if circuit.tran else 1.0
-    for text in circuit_warnings(circuit, t_stop):
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    t_stop = 1.0 if t_stop is None and circuit.tran is None else t_stop
     problem = prepare(circuit, t_stop=t_stop, charge_law=charge_law, area=area, charge=charge, rtol=rtol)
+    for text in circuit_warnings(circuit, problem.t_stop):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return make_plan(problem, rtol, tier)
 
 
@@ -207,8 +208,7 @@ def run_problem(
     run, name = integrated(problem, plan, rtol, method, progress)
     run.stats["wall_s"] = time.perf_counter() - begin  # type: ignore[assignment]
     # Report the times asked for, not the breakpoints to which `at_breakpoints` has moved some of them.
-    t = t_out if run.t.size == t_out.size else np.concatenate([t_out[: run.t.size], run.t[t_out.size :]])
-    t = t if run.status is Status.SUCCESS else run.t
+    t = t_out[: run.t.size] if run.status is Status.SUCCESS else run.t
     return solution_of(problem, plan, run, run.record(problem), t, rtol, name)
 
 
@@ -294,10 +294,9 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
         run.detail = run.detail or ROUGH.format(run.rough)
     rounding = problem.rounding
     for gap in run.gaps:
-        if gap[0] <= rounding:
+        if 0.0 < gap[0] <= rounding:
             # To round-off the gap is at 0 V: state at least that round-off as its error, and its square for the force.
-            share = rounding / gap[0] if gap[0] > 0.0 else 0.0
-            gap[2:] = np.maximum(gap[2:], (share * gap[0], share**2 * gap[1]))
+            gap[2:] = np.maximum(gap[2:], (rounding, (rounding / gap[0]) ** 2 * gap[1]))
     # A closed form is not refused for its round-off, however small `rtol` is: no other method has a smaller error.
     judged = plan.tier == "coupled" or plan.error_bound > 0.0 or run.rough > 0.0
     if run.status is Status.SUCCESS and judged and excess_of(run.gaps, rounding) > rtol:

@@ -96,7 +96,7 @@ class Stepping(Integration):
         """Go to the start, with an initial state and an error of a step (V)."""
         self.controls, self.step = np.zeros(1, readout.CONTROL), np.zeros(1, readout.STEP)
         self.control = self.controls[0]
-        self.control["t"], self.control["margin"] = self.problem.t_start, 1.0
+        self.control["t"], self.control["margin"], self.control["magnified"] = self.problem.t_start, 1.0, 1.0
         self.branch = np.full((self.net.gap.size, 2), [self.problem.t_start, math.inf])  # As in `LoopState`
         self.counters, self.error = np.zeros(readout.N_COUNTERS, np.int64), np.zeros(self.n_error)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))

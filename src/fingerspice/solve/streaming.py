@@ -156,9 +156,8 @@ class Stream:
         piece, o = march.pieces[march.place], self.outputs
         # All outputs up to the end of the piece, and a few more.
         end = math.ceil((piece.stop - o.start) / o.spacing) - o.low + 2
-        t = run_at = o.times(self._written, max(end, self._written))
-        if o.rate is None:
-            run_at = at_breakpoints(replace(self.problem, t_start=piece.start, t_stop=piece.stop), t)
+        t = o.times(self._written, max(end, self._written))
+        run_at = at_breakpoints(replace(self.problem, t_start=piece.start, t_stop=piece.stop), t)
         out = march.outputs_at(run_at)
         try:
             march.follow(run_at, out)
@@ -266,17 +265,14 @@ def stream(
         While iterating, where the run fails; its `solution` holds the outputs after the last chunk.
     """
     rtol = check_arguments(rtol, method, area, start)
-    chunk = None if chunk is None else positive_number("chunk", chunk, "s")
+    require(chunk is None or count is None, "count", "given beside chunk", "one of them")
+    length = positive_number("chunk", CHUNK if chunk is None else chunk, "s")
     step = None if step is None else positive_number("step", step, "s")
-    if count is not None:
-        count = whole_number("count", count, 1)
-        require(chunk is None, "count", "given beside chunk", "one of them")
+    count = None if count is None else whole_number("count", count, 1)
     circuit = overridden(circuit, sources, parameters)
     problem = asked(circuit, t_stop=t_stop, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol)
     check_length(problem.network.waveform, problem.t_start, problem.t_stop)
     outputs = Outputs(problem, step)
-    if count is None:
-        count = max(1, round((CHUNK if chunk is None else chunk) / outputs.spacing))
-    count = min(count, outputs.total)
+    count = min(count or max(1, round(length / outputs.spacing)), outputs.total)
     check_outputs(circuit, count)
     return Stream(problem, make_plan(problem, rtol, tier, method), outputs, count, rtol, method)
