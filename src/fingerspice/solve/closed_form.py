@@ -85,9 +85,7 @@ def _along(matrix: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kj,tj->tk", matrix, values))
 
 
-def _answer(
-    problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray
-) -> tuple[list[FloatArray], float]:  # fmt: skip
+def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray) -> tuple[list[FloatArray], float]:
     """Modes (n_t, n), and sources, their integrals and slopes (n_t, n_s), at the outputs reached; and an end, s.
 
     The last row is the left-hand response at the end of the windows.

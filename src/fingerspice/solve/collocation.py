@@ -67,9 +67,7 @@ def scratch_of(system: System) -> tuple[StepTables, Work]:
     return tables, work
 
 
-def system_of(
-    scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO, u_peak: float = 0.0
-) -> System:  # fmt: skip
+def system_of(scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO, u_peak: float = 0.0) -> System:
     """The modal system of a scene for tolerances of a decade, with neighbouring reference areas in at most `ratio`.
 
     The area curve reaches `u_top` (V) and the reference areas `u_peak` (V) if these are above 0.
@@ -140,9 +138,7 @@ class Track(Stepping):
         return from_loop(self.problem.scene, self.t, self.y, before, u_gap)
 
     def jump(self, after: FloatArray) -> bool:
-        met = enter(
-            self.system.model, self.pace.charge, float(after[0]), self.y, self.control, self.sign, self.branch
-        )  # fmt: skip
+        met = enter(self.system.model, self.pace.charge, float(after[0]), self.y, self.control, self.sign, self.branch)
         self.control["u_before"] = after[0]
         return bool(met)
 

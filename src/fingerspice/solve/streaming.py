@@ -148,8 +148,9 @@ class Stream:
             count -= t.size
         if len(found) == 1:
             return found[0]
-        # The numbers of a column stay together in memory, as they are read.
-        return np.concatenate([t for t, _ in found]), np.concatenate([rows.T for _, rows in found], axis=1).T
+        # The numbers of a column stay together in memory, as they are read. Windows have unwanted charges, too.
+        width = min(rows.shape[1] for _, rows in found)
+        return np.concatenate([t for t, _ in found]), np.concatenate([rows.T[:width] for _, rows in found], axis=1).T
 
     def _piece(self, march: LaneMarch) -> tuple[FloatArray, FloatArray]:
         """Times (s) and rows of the next piece of a recording."""
@@ -167,7 +168,7 @@ class Stream:
             return self._window()
         count = march.outputs
         self._written += count
-        return t[:count], march.form.recorded(self.problem, out[:, :count])
+        return t[:count], out[:, :count].T
 
     def _window(self) -> tuple[FloatArray, FloatArray]:
         """Times (s) and rows of the next window."""

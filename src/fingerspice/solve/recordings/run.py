@@ -265,7 +265,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None) -> Ru
             continue
         except LostError:
             return None
-        run = march.run(t_out, problem.left, march.form.recorded(problem, out))
+        run = march.run(t_out, problem.left, out.T)
         run.stats["rejected"] += refused
         # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
         if excess_of(run.gaps, problem.rounding) <= rtol:
