@@ -62,7 +62,7 @@ class Outputs:
         return np.asarray(np.minimum(t, self.stop))
 
 
-class Stream:
+class Stream(Iterator[Solution]):
     """A run chunk by chunk: an iterator over `Solution` objects, made by `fs.stream`.
 
     Attributes
@@ -90,9 +90,6 @@ class Stream:
         # and the run of the last window.
         self._asked, self._method = (method, method) if found is None else ("exponential", "relaxation")
         self._last = Run(*_NO_OUTPUTS, Status.SUCCESS, 0, {}, problem.initial)
-
-    def __iter__(self) -> Iterator[Solution]:
-        return self
 
     def __len__(self) -> int:
         """Total number of chunks."""
