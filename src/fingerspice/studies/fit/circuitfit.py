@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -174,12 +174,7 @@ class Task(Problem):
     rtol: float
     charge_law: str | None
     watch: Callable[[], None]  # Called before every evaluation
-
-    @property
-    def box(self) -> FloatArray:
-        """Bounds also where none are given, far from the start: there are no likely values, and slow runs."""
-        (low, high), near, far = self.bounds.T, self.initial / FARTHEST, self.initial * FARTHEST
-        return np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
+    reach: ClassVar[float] = FARTHEST  # There are no likely values beyond it, and slow runs
 
     def remedy(self, names: tuple[str, ...]) -> str:
         """A measurement that would add what is missing: at another voltage, frequency or load."""
