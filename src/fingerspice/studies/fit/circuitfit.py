@@ -313,19 +313,13 @@ class Fit(FitResult):
         data, circuit = self.data, self.circuit
         signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
         signal = f"mean {signal}" if data.name.endswith("_mean") else signal
-        # What changed most stands along the axis, and every value of the rest has a curve.
-        varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
-        axes = [(meaning_of(circuit, path), circuit.parameters[path].unit, x) for path, x in varying]
+        axes = [(meaning_of(circuit, path), circuit.parameters[path].unit, x) for path, x in data.varying.items()]
         numbers = np.arange(1.0, data.values.size + 1.0, dtype=np.float64)
         # Conditions that vary go without times.
         alone = ("measurement", "", numbers) if data.t is None else ("time", "s", data.t)
-        (label, unit, x), *others = axes or [alone]
-        groups = data.groups.items() if varying else ()
-        keys = [[f"{column} = {one}" for one in of] for column, of in groups]
-        keys += [[f"{name} = {y:g} {unit}".rstrip() for y in values] for name, unit, values in others]
-        names = list(map(", ".join, zip(*keys, strict=True))) or ["measured and fitted"] * data.values.size
-        columns = x, data.values, self.predicted, self.sigma
-        return [(names, columns, f"{label} [{unit}]" if unit else label, signal, MEASURED[data.signal])]
+        keys = [[f"{column} = {one}" for one in of] for column, of in data.groups.items() if axes]
+        columns = data.values, self.predicted, self.sigma
+        return [self._panel(axes or [alone], keys, signal, MEASURED[data.signal], *columns)]
 
     def to_dict(self) -> dict[str, Any]:
         return super().to_dict() | {

@@ -343,6 +343,17 @@ class FitResult(Shown):
     def _panels(self) -> list[Any]:
         raise NotImplementedError
 
+    @staticmethod
+    def _panel(
+        under: Sequence[tuple[str, str, Any]], keys: Sequence[Sequence[str]], shown: str, unit: str, *columns: Any
+    ) -> Any:
+        """A panel of `plot_panels`: of the conditions that which changed most is the axis, and the rest name curves."""
+        (label, axis, x), *others = sorted(under, key=lambda one: -np.unique(one[2]).size)
+        varying = [one for one in others if np.ptp(one[2]) > 0.0]
+        rest = [[f"{name} = {y:g} {of}".rstrip() for y in values] for name, of, values in varying]
+        curves = list(map(", ".join, zip(*keys, *rest, strict=True))) or [shown] * x.size
+        return curves, (x, *columns), f"{label} [{axis}]" if axis else label, shown, unit
+
     def _columns(self) -> dict[str, Any]:
         """Columns of the table, by their heads."""
         raise NotImplementedError
