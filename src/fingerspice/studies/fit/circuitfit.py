@@ -399,9 +399,6 @@ def fit(
         raise InputError(f"the circuit has {gaps} GAPs; allowed: one, to which the data belong")
     if average == "run" and circuit.tran is None and measured.name.endswith("_mean"):
         raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
-    own = {f"{e.name}.f" for e in circuit.by_device("SKIN")} & {*measured.conditions, *paths}
-    if skin == "follow" and own and measured.name.endswith("_mean"):
-        raise InputError(f"skin='follow' and {own.pop()} are both given; allowed: one of them")
     bar, begun, count = Bar("fitting", endless=True), time.perf_counter(), itertools.count(1)
 
     def watch() -> None:
@@ -457,7 +454,7 @@ def _request(
 
 
 def _fitted(task: Task, starts: int) -> Fit:
-    from scipy.stats import norm, t
+    from scipy.stats import t
 
     data, n = task.data, task.data.values.size
     ends = [followed(task.residuals, task.box, begin) for begin in _starts(task, starts)]
@@ -481,11 +478,10 @@ def _fitted(task: Task, starts: int) -> Fit:
             # Shares that fit to the last bit are the likelier ones.
             if least == 0.0 or 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY:
                 task, ends, best = shares, others, other
-    variance, reach = math.inf, math.inf
-    if data.sigma is not None:
-        variance, reach = 1.0, float(norm.ppf(0.975))
-    elif freedom > 0:
-        variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
+    # Of a known sigma Student's t is that of infinitely many degrees of freedom; with none left, nothing is known.
+    left = math.inf if data.sigma is not None else freedom
+    variance = 1.0 if left == math.inf else best.objective / left if left > 0 else math.inf
+    reach = float(t.ppf(0.975, left)) if left > 0 else math.inf
     # The geometric mean of one value is that value to the last digit.
     means = {path: best.values[np.unique(at)] for path, at in task.places.items()}
     (of,) = data.groups.values() or ((),)

@@ -378,7 +378,7 @@ def _errors(task: Task, best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray
     (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
     residuals, and a part in the variance of a parameter; without a measure of one that has a part, nothing is known.
     """
-    from scipy.stats import norm, t
+    from scipy.stats import t
 
     covariance, left = best.covariance, np.array([freedom for _, _, freedom in pools])
     parts = np.array([np.sum((covariance @ best.by_log[at].T) ** 2, axis=1) for _, at, _ in pools])
@@ -386,7 +386,7 @@ def _errors(task: Task, best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray
     with np.errstate(divide="ignore", invalid="ignore"):
         each = shares**2 / np.where(left >= _FEWEST, left, 0.0)[:, None]
         inverse = np.where(shares > _NO_PART, each, 0.0).sum(axis=0)
-        reach = np.where(inverse > 0.0, t.ppf(0.975, 1.0 / inverse), norm.ppf(0.975))
+        reach = t.ppf(0.975, 1.0 / inverse)
     known, notes = np.isfinite(inverse), list[str]()
     for name, at, freedom in pools:
         if freedom < _FEWEST:

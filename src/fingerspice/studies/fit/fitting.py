@@ -268,11 +268,6 @@ class Estimate:
     high: float
     at_bound: bool
 
-    @property
-    def share(self) -> float:
-        """The error over the value, which is that of the logarithm."""
-        return self.error / self.value
-
 
 @dataclass(frozen=True)
 class Profile:
@@ -323,15 +318,16 @@ class FitResult(Shown):
         # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal distribution
         # and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
         rooms = dict(zip(task.names, np.broadcast_to(variance * half**2, spread.shape).tolist(), strict=True))
+        off = dict(zip(task.names, error.tolist(), strict=True))
         bound = (f"{e.path} is at its bound, {e.value:g} {e.unit}".rstrip() for e in estimates.values() if e.at_bound)
         notes = [f"{said}: its interval is not that of a free parameter." for said in bound]
         for a, b, both in _pairs(estimates, correlation, _TOGETHER):
-            if max(estimates[a].share, estimates[b].share) > _NOTABLE:
+            if max(off[a], off[b]) > _NOTABLE:
                 said = f"{a} and {b} are not told apart (correlation {both:+.4f}): they change these data in almost"
                 notes.append(f"{said} the same way, and only a combination of both is known. {task.remedy((a, b))}")
         named = " ".join(notes)
-        for name, one in estimates.items():
-            if not one.share < _UNKNOWN and name not in named:
+        for name in task.names:
+            if not off[name] < _UNKNOWN and name not in named:
                 said = f"Of {name} these data tell next to nothing: its error is larger than itself."
                 notes.append(f"{said} {task.remedy((name,))}")
         return cls(
@@ -373,7 +369,7 @@ class FitResult(Shown):
         """A page of what was fitted to what (`head`), the residuals (`about`), and everything else."""
         rows = [
             (
-                e.path, f"{e.value:.6g}", f"{e.error:.2g}", f"{100.0 * e.share:.2g} %",
+                e.path, f"{e.value:.6g}", f"{e.error:.2g}", f"{100.0 * e.error / e.value:.2g} %",
                 f"{e.low:.4g} to {e.high:.4g}", e.unit, f"{e.initial:.4g}", "at a bound" if e.at_bound else "",
             )
             for e in self.estimates.values()
@@ -404,7 +400,7 @@ class FitResult(Shown):
         }  # fmt: skip
         lines = ["[[Fit Statistics]]", *(f"    {name:<18} = {x}" for name, x in figures.items()), "[[Variables]]"]
         for name, e in estimates.items():
-            share = f"({100.0 * e.share:.2f}%) (init = {e.initial:.7g})"
+            share = f"({100.0 * e.error / e.value:.2f}%) (init = {e.initial:.7g})"
             lines.append(f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} {share}")
         if pairs := sorted(_pairs(estimates, self.correlation, _TOLD), key=lambda pair: -abs(pair[2])):
             lines.append("[[Correlations]] (unreported correlations are < 0.100)")
@@ -430,7 +426,7 @@ def _profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Prof
     from scipy.optimize import brentq
 
     place, limit = task.names.index(one.path), best.objective + room
-    here, error = math.log(best.values[place]), one.share
+    here, error = math.log(best.values[place]), one.error / one.value
     # The least objectives that were looked for, by the parameter's logarithm, and the others' values at the last.
     known, begin = {here: best.objective}, np.delete(best.values, place)
 
