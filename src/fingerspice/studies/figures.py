@@ -112,9 +112,8 @@ def figure_2() -> Drawn:
         (right, eps, r"Relative permittivity $\varepsilon_\mathrm{r,sc}$", "Eq. 19", drawing.VERMILION, (1e3, 1e4)),
     ):
         ax.loglog(f, y, color=color, linewidth=1.6)
-        drawing.dress(ax, label, "Frequency $f$ [Hz]")
+        drawing.dress(ax, label, "Frequency $f$ [Hz]", xlim=SKIN_BAND, ylim=limits)
         ax.set_title(title, fontsize=drawing.FONT, loc="left")
-        ax.set(xlim=SKIN_BAND, ylim=limits)
     return figure, {"frequency [Hz]": f, "rho_sc [ohm m]": rho, "eps_r_sc [1]": eps}
 
 
@@ -137,13 +136,11 @@ def figure_3(points: int = 46) -> Drawn:
             ax.semilogx(f, force, label=label, color=color, linestyle=dash, linewidth=width)
         other_scale = variation.name == "d_a"
         ax.set_title(variation.title + " (other scale)" * other_scale, fontsize=drawing.FONT, loc="left")
-        ax.set(xlim=(f[0], f[-1]), ylim=(0.0, 0.25 if other_scale else 0.125))
+        y_label = r"Mean force $F_\mathrm{el}$ [N]" if ax in axes[::2] else ""
+        x_label, top = "Frequency $f$ [Hz]" if ax in axes[2:] else "", 0.25 if other_scale else 0.125
+        drawing.dress(ax, y_label, x_label, xlim=(f[0], f[-1]), ylim=(0.0, top))
         # In the corner that the panel's curves leave free.
         ax.legend(loc=4 if variation.name == "r_a" else 2, fontsize=drawing.FONT - 1.0, frameon=False)
-    for ax in axes[::2]:
-        drawing.dress(ax, r"Mean force $F_\mathrm{el}$ [N]")
-    for ax in axes[2:]:
-        drawing.dress(ax, "", "Frequency $f$ [Hz]")
     return figure, columns
 
 
@@ -195,14 +192,11 @@ def _time_figure(shape: type[Sine] | type[Square]) -> Drawn:
         for ax in (upper, lower):
             drawing.legend_above(ax, right=True, math=True)
         upper.set_title(f"{frequency:g} Hz", fontsize=drawing.FONT + 0.5, loc="left", weight="bold")
-        upper.set_xlim(-0.02 * t[-1], 1.02 * t[-1])
-        upper.set_xticks(np.linspace(0.0, t[-1], 5))
-        drawing.dress(lower, "", f"Time [{unit}]")
+        ends, marks = (-0.02 * t[-1], 1.02 * t[-1]), np.linspace(0.0, t[-1], 5)
+        drawing.dress(lower, "", f"Time [{unit}]", xlim=ends, xticks=marks)
         parts.append((np.full(data["t"].size, frequency), *data.values()))
     drawing.dress(axes[0], "Voltage [V]")
-    drawing.dress(axes[2], r"Force $F_\mathrm{el}$ [N]")
-    for ax in axes[2:]:
-        ax.set_ylim(0.0, None)
+    drawing.dress(axes[2], r"Force $F_\mathrm{el}$ [N]", ylim=(0.0, None))
     return figure, {name: np.concatenate(c) for name, c in zip(header, zip(*parts, strict=True), strict=True)}
 
 
