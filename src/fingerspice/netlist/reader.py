@@ -34,10 +34,14 @@ LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
 MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30  #: Of a file, and of all the files that a deck's sources name.
 
 
-@cache
 def library_text(law: str) -> str:
-    """Text of a charge law's library, from the installed package or the source tree."""
-    name = LIBRARIES[law]
+    """Text of a charge law's library."""
+    return shipped_text(LIBRARIES[law])
+
+
+@cache
+def shipped_text(name: str) -> str:
+    """Text of a file of `circuits` that the package needs, from the installed package or the source tree."""
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "lib", package.parents[1] / "circuits"):
         if (path := folder / name).is_file():

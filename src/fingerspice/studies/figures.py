@@ -15,6 +15,7 @@ from fingerspice.base.errors import FingerspiceWarning
 from fingerspice.base.files import write_csv
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.netlist.netlist import parse_netlist
+from fingerspice.netlist.reader import shipped_text
 from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.plots import drawing
 from fingerspice.results.solution import Solution
@@ -23,17 +24,6 @@ from fingerspice.studies.steady import phasor, steady_state
 from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import Sine, Waveform, require
 
-TABLE1_DECK = """\
-Fingerpad on a 3M-coated touchscreen, Table 1
-Vdrive  drive 0          SIN(0 200 100)
-Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg
-Xgap    top   skin area  GAP   d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3
-+                              alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
-Xskin   skin  0    area  SKIN  d=350u f=100
-.tran 10u 50m uic
-.end
-"""
-"""Table 1 under a sine of 200 V and 100 Hz (Fig. 4, left), as in `circuits/fingerpad.cir`."""
 #: Source amplitudes of Fig. 3, and of Figs. 4 and 5, V; and the frequencies of the latter, Hz.
 U0_FORCE, U0_TIME, FREQUENCIES = 140.0, 200.0, (100.0, 5000.0)
 # Letters of units in a data file.
@@ -41,9 +31,9 @@ _ASCII = str.maketrans({"µ": "u", "²": "^2", "Ω": "ohm"})
 
 
 def table1_circuit(*, dispersive: bool = False) -> Circuit:
-    """The circuit of `TABLE1_DECK`; with `dispersive` its skin has its own data at every frequency."""
-    own = TABLE1_DECK.replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE d=350u")
-    return parse_netlist(own if dispersive else TABLE1_DECK)
+    """Table 1 under a sine of 200 V and 100 Hz (Fig. 4, left); with `dispersive` its skin follows the frequency."""
+    deck = shipped_text("fingerpad.cir")
+    return parse_netlist(deck.replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE d=350u") if dispersive else deck)
 
 
 class Variation(NamedTuple):
