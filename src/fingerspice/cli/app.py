@@ -383,9 +383,7 @@ for _function, _options in _COMMANDS.items():
 
 
 @app.callback(invoke_without_command=True)
-def _root(
-    version: Annotated[bool, Option("--version", help="Print the version.", is_eager=True)] = False,
-) -> None:
+def _root(version: Annotated[bool, Option("--version", help="Print the version.", is_eager=True)] = False) -> None:
     if version:
         say(f"fingerspice {fs.__version__}")
         raise typer.Exit

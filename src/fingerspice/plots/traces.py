@@ -417,7 +417,7 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
         for ax, (values, label, color) in zip(axes, panels, strict=True):
             marker = "o" if order.size < 12 else ""
             ax.plot(r.frequency[order], values[order], color=color, linewidth=1.5, marker=marker, **style)
-            drawing.dress(ax, label, xscale="log")
+            drawing.dress(ax, label, "Frequency [Hz]" if ax in axes[-len(axes) // 2 :] else "", xscale="log")
     how = f"source amplitude {f'{one.amplitude:.4g} V' if np.isfinite(one.amplitude) else 'no fundamental'}"
     how = one.drive if nodes else how if len(results) == 1 else "several source amplitudes"
     if nodes:
@@ -440,8 +440,6 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     spans = [(a, b) for a, b in outside if b > a]
     for (a, b), ax in itertools.product(spans, axes):
         ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
-    for ax in axes[-len(axes) // 2 :]:
-        ax.set_xlabel("Frequency [Hz]", fontsize=drawing.FONT)
     shaded = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
     drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, shaded) if p))
     return figure

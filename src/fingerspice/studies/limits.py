@@ -113,8 +113,7 @@ class Capability(Shown):
         right.set_ylim(bottom=0.0)
         for ax, label in ((left, f"Mean friction [{unit}]"), (right, f"Largest amplitude, best mean [{unit}]")):
             drawing.dress(ax, label, "Modulation frequency [Hz]", xscale="log")
-        wave = "unipolar drive" if self.carrier is None else f"carrier {format_si(self.carrier, 'Hz')}"
-        drive = f"at most {format_si(self.limit, 'V')}, {wave}"
+        drive = f"at most {format_si(self.limit, 'V')} {on_carrier(self.carrier)}"
         drawing.caption(figure, f"{heading(self.circuit)} · {drive} · mean friction {self._range()}")
         return figure
 

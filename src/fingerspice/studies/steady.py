@@ -76,8 +76,7 @@ def sweep_frequencies(sweep: AcSweep) -> FloatArray:
     """Frequencies (Hz) of an ``.ac`` line, of which at most `MAX_FREQUENCIES` are allowed."""
     base, ratio = (10.0 if sweep.scale == "dec" else 2.0), sweep.stop / sweep.start
     count = sweep.points - 1.0 if sweep.scale == "lin" else math.log(ratio) / math.log(base) * sweep.points
-    if not count < MAX_FREQUENCIES:
-        raise InputError(f"the sweep has {count + 1.0:.3g} frequencies; allowed: at most {MAX_FREQUENCIES}")
+    refuse(count >= MAX_FREQUENCIES, f"the sweep has {count + 1.0:.3g} frequencies; allowed: at most {MAX_FREQUENCIES}")
     if sweep.scale == "lin":
         return np.linspace(sweep.start, sweep.stop, sweep.points)
     n = math.floor(count + 1e-9)
