@@ -223,7 +223,7 @@ def _told(answer: dict[str, Any], found: Any) -> str:
     rows = summary(found)
     answer.update(figures=rows, failed=int((found.status >= 2).sum()))
     keys = {"5 %": "p5", "median": "median", "95 %": "p95", "mean": "mean"}
-    cells = [(row["output"], row["unit"], *(f"{row[key]:.4g}" for key in keys.values())) for row in rows]
+    cells = [(f"{row['output']}", f"{row['unit']}", *(f"{row[key]:.4g}" for key in keys.values())) for row in rows]
     return Table(("output", "unit", *keys), cells, left=2).text()
 
 
