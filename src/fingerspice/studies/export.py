@@ -14,7 +14,7 @@ from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import find_branches
-from fingerspice.netlist.reader import LIBRARIES, library_text
+from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from fingerspice.physics.contact import Contact
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
@@ -82,7 +82,7 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     if (ac := circuit.ac) is not None:
         lines.append(f".ac {ac.scale} {ac.points} {ac.start!r} {ac.stop!r}")
     lines += _start_lines(circuit, areas, contacts)
-    lines += ["", library_text(law).rstrip(), "", _OPTIONS, ".end", ""]
+    lines += ["", shipped_text(law).rstrip(), "", _OPTIONS, ".end", ""]
     return "\n".join(lines)
 
 
