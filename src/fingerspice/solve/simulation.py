@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import Parameters, Sources, area_given, circuit_warnings, overridden
+from fingerspice.circuit.describe import Parameters, Sources, circuit_warnings, overridden
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
@@ -109,7 +109,7 @@ def simulate(
     SolveError
         Where the run failed and `throw` is set; its `solution` holds the outputs before the failure.
     """
-    rtol = check_arguments(rtol, method, area, start, jumps)
+    rtol = check_arguments(rtol, method, start, jumps)
     # Of their own: results keep them, and the caller's array stays writable.
     times = None if t_eval is None else real_numbers("t_eval", t_eval, "numbers in s").copy()
     circuit = overridden(circuit, sources, parameters)
@@ -142,21 +142,14 @@ def rtol_given(rtol: object, least: float = RTOL_RANGE[0]) -> float:
     return number
 
 
-def check_arguments(
-    rtol: float,
-    method: str = "auto",
-    area: str | float = "coupled",
-    start: str | Solution = "deck",
-    jumps: str = "both",
-) -> float:
-    """`rtol` as a number; arguments of `simulate` that no circuit can run with are refused."""
+def check_arguments(rtol: float, method: str = "auto", start: str | Solution = "deck", jumps: str = "both") -> float:
+    """`rtol` as a number; arguments of `simulate` that no circuit can run with are refused, but for the area."""
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
     library, _, name = method.partition(":")
     if method not in METHODS and not (library in LIBRARIES and name):
         known = [*METHODS, *(f"{library}:NAME" for library in LIBRARIES)]
         raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
-    area_given(area)
     if not (isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)):
         raise InputError(f"start is {start!r}; allowed: {', '.join(map(repr, STARTS))} or a Solution")
     return rtol_given(rtol)
@@ -181,7 +174,7 @@ def plan(
     InputError
         For a request that cannot be run.
     """
-    rtol = check_arguments(rtol, area=area)
+    rtol = rtol_given(rtol)
     circuit = overridden(circuit, sources, parameters)
     t_stop = real_number("t_stop", t_stop, "a number in s") if t_stop is not None else None if circuit.tran else 1.0
     for text in circuit_warnings(circuit, t_stop):
@@ -207,8 +200,7 @@ def run_problem(
     run, name = integrated(problem, plan, rtol, method, progress)
     run.stats["wall_s"] = time.perf_counter() - begin  # type: ignore[assignment]
     # Report the times asked for, not the breakpoints to which `at_breakpoints` has moved some of them.
-    t = t_out if run.t.size == t_out.size else np.concatenate([t_out[: run.t.size], run.t[t_out.size :]])
-    t = t if run.status is Status.SUCCESS else run.t
+    t = t_out[: run.t.size] if run.status is Status.SUCCESS else run.t
     return solution_of(problem, plan, run, run.record(problem), t, rtol, name)
 
 

@@ -265,7 +265,7 @@ def stream(
     SolveError
         While iterating, where the run fails; its `solution` holds the outputs after the last chunk.
     """
-    rtol = check_arguments(rtol, method, area, start)
+    rtol = check_arguments(rtol, method, start)
     chunk = None if chunk is None else positive_number("chunk", chunk, "s")
     step = None if step is None else positive_number("step", step, "s")
     if count is not None:
