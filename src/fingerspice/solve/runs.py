@@ -82,15 +82,18 @@ class Run:
             self.rows = np.vstack([self.rows, row])
 
     def add_error(self, u_gap: FloatArray | float, f_el: FloatArray | None = None) -> None:
-        """Add errors that the method does not estimate, V and N; by default f_el follows from u_gap, as F ~ u^2."""
-        gaps = self.gaps.copy()
+        """Add errors that the method does not estimate, V and N, as in `with_error`."""
+        self.gaps = with_error(self.gaps, u_gap, f_el)
         if self.node_error is not None:
             self.node_error += float(np.max(u_gap, initial=0.0))
-        if f_el is None:
-            f_el = 2.0 * u_gap * gaps[:, 1] / np.where(gaps[:, 0] > 0.0, gaps[:, 0], np.inf)
-        gaps[:, 2] += u_gap
-        gaps[:, 3] += f_el
-        self.gaps = gaps
+
+
+def with_error(gaps: FloatArray, u_gap: FloatArray | float, f_el: FloatArray | None = None) -> FloatArray:
+    """`Run.gaps` with more errors, V and N; by default f_el follows from u_gap, as F ~ u^2 A and A falls with u."""
+    u, f = gaps[:, 0], gaps[:, 1]
+    if f_el is None:
+        f_el = 2.0 * u_gap * f / np.where(u > 0.0, u, np.inf)
+    return np.column_stack([u, f, gaps[:, 2] + u_gap, gaps[:, 3] + f_el])
 
 
 def excess_of(gaps: FloatArray, rounding: float) -> float:

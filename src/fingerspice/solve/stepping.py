@@ -14,11 +14,12 @@ from fingerspice.engine.collocation.loop import Circuit, Looks
 from fingerspice.engine.collocation.readout import LoopState, Outputs
 from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Sources
+from fingerspice.engine.one_area.system import area_missed
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.steps import Recorder
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Integration, Run, excess_of
+from fingerspice.solve.runs import Integration, Run, excess_of, with_error
 from fingerspice.waveforms.sampling import same_time
 
 FEWEST_PERIODS = 6.0  # Runs of fewer periods are integrated throughout, because nothing would be saved
@@ -52,7 +53,8 @@ class Stepping(Integration):
     n_error: int  # Size of `LoopState.error`
     gaps: list[int]  # Rows of `peaks` of the gaps whose errors are stated
     largest: float  # Voltage (V) beside the peaks that the round-off of the charge goes with
-    area_error: float  # Relative error of the areas' polynomials
+    decade: int  # Of the relative error asked for, which chooses the areas' polynomials
+    curves: FloatArray  # (n_area, l): Of the areas, as in `Net`
     capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
     charge_safety = 1.0  # Stated error of the charge over the estimate
     rates: FloatArray  # Decay rates of the modes, among them those at 0 V, 1/s
@@ -114,7 +116,7 @@ class Stepping(Integration):
 
     @property
     @abstractmethod
-    def rounding(self) -> list[float]:
+    def rounding(self) -> FloatArray:
         """Round-off of the voltage of every area's gap and, last, of the nodes, V."""
 
     @property
@@ -139,14 +141,9 @@ class Stepping(Integration):
             if code != readout.PAUSED:
                 return code
 
-    def stated_peaks(self) -> list[list[float]]:
+    def stated_peaks(self) -> FloatArray:
         """Peaks so far, of every area's gap and of the nodes, with their stated errors: estimates and round-off."""
-        found = []
-        for (u, f, u_error, f_error), floor in zip(self.peaks.tolist(), self.rounding, strict=True):
-            # F ~ u^2 A, and A falls with u.
-            steepest = 2.0 * f / u if u > 0.0 else 0.0
-            found.append([u, f, SAFETY * u_error + floor, SAFETY * f_error + floor * steepest])
-        return found
+        return with_error(self.peaks * [1.0, 1.0, SAFETY, SAFETY], self.rounding)
 
     def stated(self, run: Run) -> None:
         """Write the recorded steps, the stated errors and the margin into a run."""
@@ -154,8 +151,7 @@ class Stepping(Integration):
         peaks, shown = self.stated_peaks(), self.problem.scene.shown
         run.continuous = self.recorder.finish(self.problem.first, partial(Record, shown.network, shown.net))
         run.stats["repeated"] = self.repeated
-        run.gaps, run.margin = np.array([peaks[i] for i in self.gaps]).reshape(-1, 4), self.margin
-        run.node_error = peaks[-1][readout.ERROR_U]
+        run.gaps, run.margin, run.node_error = peaks[self.gaps], self.margin, float(peaks[-1, readout.ERROR_U])
         if not self.pace.charge:
             return
         # Errors of unknown sign are the same in every period: they add up from one to the next, instead of cancelling.
@@ -163,13 +159,12 @@ class Stepping(Integration):
         alike = (self.t - self.problem.t_start) / self.period - self.repeated
         known, spread = float(self.control["error_q"]), max(self.collected[1].tolist(), default=0.0)
         estimate = SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
-        held = self.capacitance * (self.largest + max(peak[readout.PEAK_U] for peak in peaks))
+        held = self.capacitance * (self.largest + float(peaks[:, readout.PEAK_U].max()))
         moved = max(float(self.control["peak_q"]), *map(abs, self.y[-self.s_before.size :].tolist()))
         # Every step adds the round-off of the charge that is held, and the relative error of the areas' polynomials is
         # also a relative error of all charge moved.
-        run.charge_error = float(
-            self.charge_safety * estimate + 4e-16 * held * steps + self.area_error * (held + moved)
-        )
+        missed = max((area_missed(curve, self.decade) for curve in self.curves), default=0.0)
+        run.charge_error = float(self.charge_safety * estimate + 4e-16 * held * steps + missed * (held + moved))
 
     def through(self, sources: Sources, t_end: float) -> Status:
         # A period that has been repeated may have led there already.
@@ -181,7 +176,7 @@ class Stepping(Integration):
             if code == readout.LOOKED_AT:
                 self._settle()
             elif code == readout.EXCESSIVE:
-                if excess_of(np.array(self.stated_peaks())[self.gaps], self.problem.rounding) > self.asked:
+                if excess_of(self.stated_peaks()[self.gaps], self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
             elif code != readout.DONE:
                 return self.failed(code, sources)
@@ -240,8 +235,5 @@ class Stepping(Integration):
         self.control["t"] = stop if abs(stop - reached) <= same_time(stop) else reached
         self.branch[:, 0] += periods * period
         # What the voltages, and the charge over the capacitance, are still off the periodic state: `off` and `owed`, V.
-        for peak in self.peaks:
-            peak[readout.ERROR_U] += off
-            if peak[readout.PEAK_U] > 0.0:
-                peak[readout.ERROR_F] += off * 2.0 * peak[readout.PEAK_F] / peak[readout.PEAK_U]
+        self.peaks[:] = with_error(self.peaks, off)
         self.repeated += periods
