@@ -94,15 +94,14 @@ class Period:
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
         key = "period", self.begin, self.span, problem.step if waveform.is_sampled else 0.0
-        end = self.begin + self.span
+        self.end = self.begin + self.span
         self.tables = scene.remember(key, lambda: [
-            source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.network.waveforms
+            source_table(w, self.begin, self.end, 1e-13, problem.step) for w in scene.network.waveforms
         ], MOST_PERIODS)  # fmt: skip
         broken = [table.not_finite for table in self.tables if table.not_finite is not None]
         if broken:
             raise no_period(problem, Status.SOURCE_NOT_FINITE, min(broken))
         self.sources = joined(self.tables)
-        self.end = float(min(table.edges[-1] for table in self.tables))
         if pushed and self.begin > problem.t_start:
             # Add the charge that sources drive into the neutral modes between the run's start and the period.
             for j, wave in enumerate(scene.network.waveforms):
