@@ -299,13 +299,11 @@ class _Intervals:
             begun = [form.start(_problem(self.run, {self.name: one})) for one in moved]
             of_source[:, 0] += after @ derivative([start[:m] for start, _ in begun], step)
         # Samples before the times, and how far these are beyond, in samples.
-        out, place = np.zeros((2, wave.count)), np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)
+        place = np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)
         first = np.minimum(np.floor(place + 1e-6), wave.count - 2.0).astype(np.int64)
         beyond = np.maximum(place - first, 0.0)
-        for samples, found in zip(out, of_source, strict=True):
-            np.add.at(samples, first, (1.0 - beyond) * found)
-            np.add.at(samples, np.minimum(first + 1, wave.count - 1), beyond * found)
-        return out
+        at, shares = np.append(first, first + 1), np.append(1.0 - beyond, beyond)
+        return np.array([np.bincount(at, shares * np.tile(found, 2), wave.count) for found in of_source])
 
 
 def _problem(run: Solution, sources: dict[str, Waveform]) -> Problem:

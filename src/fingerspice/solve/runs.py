@@ -280,5 +280,5 @@ def _concerned(problem: Problem, status: Status, t: float | None) -> list[str]:
 
 def _written(problem: Problem, place: int) -> list[str]:
     """Names of the deck's sources that are combined in source number `place` of the network."""
-    stack = problem.network.stack
-    return [problem.network.sources[place].name] if stack is None else [e.name for e, _ in stack.sources]
+    drives = problem.network.drives
+    return [e.name for e, _ in (drives if problem.network.inner else drives[place : place + 1])]

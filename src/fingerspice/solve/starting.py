@@ -33,7 +33,7 @@ from fingerspice.engine.implicit import N_COUNTERS, Nodal, new_work, pass_jump
 from fingerspice.engine.network import Net, new_room, ramp
 from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
 from fingerspice.numerics.lobatto import radau_scheme
-from fingerspice.physics.contact import inverse_area
+from fingerspice.physics.contact import inverse_area, inverse_areas
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.scenes import Scene
@@ -250,19 +250,16 @@ def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
 
 def at_own_area(u: float, area: float, curve: FloatArray) -> float:
     """The gap voltage (V) on its own area that has the same charge as `u` (V) on `area` (m^2), under ``mobile``."""
-
-    def charge(v: float) -> float:
-        return v / inverse_area(v, curve)[0]
-
-    wanted, low, high = area * abs(u), 0.0, 1e-3 * abs(u)
-    # The charge grows with the voltage up to the fold, so the first interval found contains the root on the branch
-    # that starts at 0 V.
-    while charge(high) < wanted:
-        low, high = high, 1.05 * high
-        if high > 100.0 * abs(u):
-            raise InputError(f"the start has {u:.4g} V across a gap of {area * 1e6:.4g} mm^2, {PAST_FOLD}")
+    # The charge grows with the voltage up to the fold, so the first interval in which it reaches the one wanted
+    # contains the root on the branch that starts at 0 V.
+    wanted, at = area * abs(u), abs(u) * np.geomspace(1e-3, 100.0, 237)
+    reached = np.flatnonzero(at / inverse_areas(at, curve) >= wanted)
+    if not reached.size:
+        raise InputError(f"the start has {u:.4g} V across a gap of {area * 1e6:.4g} mm^2, {PAST_FOLD}")
+    low, high = np.append(0.0, at)[reached[0] : reached[0] + 2].tolist()
     while low < (middle := 0.5 * (low + high)) < high:
-        low, high = (middle, high) if charge(middle) < wanted else (low, middle)
+        enough = middle / inverse_area(middle, curve)[0] >= wanted
+        low, high = (low, middle) if enough else (middle, high)
     return math.copysign(high, u)
 
 
