@@ -29,7 +29,7 @@ from fingerspice.numerics.modes import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.results.solution import DERIVED, MEANS, SampleGradient, Sensitivity, Solution
-from fingerspice.solve.planning import asked
+from fingerspice.solve.periodic import asked
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block, driving, ready
 from fingerspice.waveforms.samples import Samples, as_samples
