@@ -113,10 +113,10 @@ class Track(Stepping):
             self.control["u_gap"], self.sign[0] = u_gap, math.copysign(1.0, u_gap)
 
     @property
-    def rounding(self) -> FloatArray:
+    def rounding(self) -> list[float]:
         # Of the nodes, the peak is that of the gap.
         peak, size = float(self.peaks[0, readout.PEAK_U]), self.problem.scene.u_size
-        return 4e-16 * np.array([peak + self.system.model.k_gap * size, peak + size])
+        return [4e-16 * (peak + self.system.model.k_gap * size), 4e-16 * (peak + size)]
 
     def circuit(self, sources: Sources) -> OneArea:
         return OneArea(self.system, *scratch_of(self.system), integral_table(), sources)
@@ -174,7 +174,7 @@ class Known:
     def __init__(self, scene: Scene, decade: int) -> None:
         n_area, (numbers, magnified, self.shapes) = scene.net.area0.size, self._referred(scene, scene.net.area0)
         counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
-        room = max(2, min(MOST_REFERENCES, MOST_NUMBERS // numbers.size))
+        room = max(3, min(MOST_REFERENCES, MOST_NUMBERS // numbers.size))
         # Memory that no reference has been written to yet costs nothing.
         self.arrays = References(np.empty((room, n_area), np.int64), np.empty((room, numbers.size)), *counts)
         self.tables = new_tables(self.shapes[0][0])
@@ -297,10 +297,11 @@ class March(Stepping):
         self.control["magnified"] = 1.0
 
     @property
-    def rounding(self) -> FloatArray:
+    def rounding(self) -> list[float]:
         u_peak = self.peaks[:, readout.PEAK_U]
         # Enlarged by the condition of the modes.
-        return np.asarray(4e-16 * (self.references.magnified * (float(u_peak.max()) + self.u_scale) + u_peak))
+        floor = 4e-16 * (self.references.magnified * (float(u_peak.max()) + self.u_scale) + u_peak)
+        return list(map(float, floor))
 
     @property
     def margin(self) -> float:

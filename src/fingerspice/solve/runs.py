@@ -104,10 +104,11 @@ class Run:
 
 def with_error(gaps: FloatArray, u_gap: FloatArray | float, f_el: FloatArray | None = None) -> FloatArray:
     """`Run.gaps` with more errors, V and N; by default f_el follows from u_gap, as F ~ u^2 A and A falls with u."""
-    u, f = gaps[:, 0], gaps[:, 1]
-    if f_el is None:
-        f_el = 2.0 * u_gap * f / np.where(u > 0.0, u, np.inf)
-    return np.column_stack([u, f, gaps[:, 2] + u_gap, gaps[:, 3] + f_el])
+    out = gaps.copy()
+    out[:, 2] += u_gap
+    # Without a voltage there is no force either.
+    out[:, 3] += 2.0 * u_gap * out[:, 1] / np.maximum(out[:, 0], LEAST_FORCE) if f_el is None else f_el
+    return out
 
 
 def excess_of(gaps: FloatArray, rounding: float) -> float:

@@ -123,23 +123,25 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Cell voltages (V), areas (m^2) and sources at the DC operating point (at 0-), the nodes in `initial` held."""
     net, stack = scene.net, scene.network.stack
-    conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in scene.network.areas}
-    added = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
-    # The reduced network of a series loop has no nodes to be held.
-    network = build_network(replace(circuit, work="gap"), added) if added else scene.network
-    s, sources = (np.array([float(w.value(0.0, "left")) for w in n.waveforms]) for n in (scene.network, network))
+    s = sources = np.array([float(w.value(0.0, "left")) for w in scene.network.waveforms])
+    network, added = scene.network, held_sources(circuit, initial) if initial else ()
+    if added:
+        # The reduced network of a series loop has no nodes to be held.
+        network = build_network(replace(circuit, work="gap"), added)
+        sources = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
     area, follows = scene.net.area0.copy(), net.gap >= 0
     held = np.array([a.node in initial for a in network.areas], bool) & follows
     area[held] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, held, strict=True) if mark]
     _refuse_floating_at_dc(network, area)
+    if not (initial or s.any()):
+        return np.zeros(len(network.cells)), area, s
     part, before = 1.0, math.inf
     for _ in range(500):
         k, b = network.stiffness(network.leak(area))
         x = np.linalg.solve(k, -b @ sources)
         u, new = network.p @ x + network.q @ sources, area.copy()
-        for i, (contact, gap) in enumerate(zip(scene.network.contacts, network.gaps, strict=True)):
-            if contact is not None and gap is not None and follows[i] and not held[i]:
-                new[i] = float(contact.area(abs(float(u[gap]))))
+        for i in np.flatnonzero(follows & ~held).tolist():
+            new[i] = 1.0 / inverse_area(abs(float(u[network.gaps[i]])), net.curves[i])[0]
         off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
         # The iteration has converged, or round-off lets it come no nearer.
         if off <= 4e-16 or 0.8 * before < off <= 1e-13:
@@ -167,6 +169,9 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
 def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) -> State:
     """State just before the start from cell voltages u (n_cell,) V; without `s`, the sources are fitted to them."""
     network, net = scene.network, scene.net
+    if s is None and not u.any() and not np.any(net.slow >= 0):
+        y, still = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
+        return State(0.0, y, still, np.zeros(len(network.areas)), scene.charge_law)
     slow, x, charge = (area / net.area0)[net.slow >= 0], u[list(network.live)], np.zeros(len(network.sources))
     rest, q = u - network.p @ x, network.q
     before = np.zeros(q.shape[1]) if s is None else s
@@ -216,6 +221,8 @@ def start_voltage(element: Element, initial: Mapping[str, float]) -> float:
 
 def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Element, ...]:
     """Voltage sources that hold the nodes of ``.ic`` (V) while the operating point is found."""
+    conductors = {n for e in circuit.elements for n in e.nodes[:2]} - {n for e in circuit.elements for n in e.nodes[2:]}
+    initial = {node: v for node, v in initial.items() if node in conductors}
     sources = circuit.by_device("V")
     taken, of_tree = spanning_tree([*(e.nodes for e in sources), *((node, "0") for node in initial)])
     known = [float(e.waveform.value(0.0, "left")) for e in sources if e.waveform is not None]
@@ -232,9 +239,10 @@ def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Elemen
 
 def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
     """Refuse a network in which some voltage is determined by capacitors only, so that it has no DC value."""
-    factor = np.vstack([network.resistor_factor, np.sqrt(network.leak(area))[:, None] * network.p])
-    if not factor.shape[1]:
+    leak = network.leak(area)
+    if np.all(leak > 0.0) or not network.live:
         return
+    factor = np.vstack([network.resistor_factor, np.sqrt(leak)[:, None] * network.p])
     # Scale the columns before the rank is determined, because conductances range over many decades.
     size = np.linalg.norm(factor, axis=0)
     _, sigma, turned = np.linalg.svd(factor / np.where(size > 0.0, size, 1.0))

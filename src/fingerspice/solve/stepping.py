@@ -116,7 +116,7 @@ class Stepping(Integration):
 
     @property
     @abstractmethod
-    def rounding(self) -> FloatArray:
+    def rounding(self) -> list[float]:
         """Round-off of the voltage of every area's gap and, last, of the nodes, V."""
 
     @property
@@ -141,9 +141,14 @@ class Stepping(Integration):
             if code != readout.PAUSED:
                 return code
 
-    def stated_peaks(self) -> FloatArray:
+    def stated_peaks(self) -> list[list[float]]:
         """Peaks so far, of every area's gap and of the nodes, with their stated errors: estimates and round-off."""
-        return with_error(self.peaks * [1.0, 1.0, SAFETY, SAFETY], self.rounding)
+        found = []
+        for (u, f, u_error, f_error), floor in zip(self.peaks.tolist(), self.rounding, strict=True):
+            # F ~ u^2 A, and A falls with u.
+            steepest = 2.0 * f / u if u > 0.0 else 0.0
+            found.append([u, f, SAFETY * u_error + floor, SAFETY * f_error + floor * steepest])
+        return found
 
     def stated(self, run: Run) -> None:
         """Write the recorded steps, the stated errors and the margin into a run."""
@@ -151,7 +156,8 @@ class Stepping(Integration):
         peaks, shown = self.stated_peaks(), self.problem.scene.shown
         run.continuous = self.recorder.finish(self.problem.first, partial(Record, shown.network, shown.net))
         run.stats["repeated"] = self.repeated
-        run.gaps, run.margin, run.node_error = peaks[self.gaps], self.margin, float(peaks[-1, readout.ERROR_U])
+        run.gaps, run.margin = np.array([peaks[i] for i in self.gaps]).reshape(-1, 4), self.margin
+        run.node_error = peaks[-1][readout.ERROR_U]
         if not self.pace.charge:
             return
         # Errors of unknown sign are the same in every period: they add up from one to the next, instead of cancelling.
@@ -159,11 +165,14 @@ class Stepping(Integration):
         alike = (self.t - self.problem.t_start) / self.period - self.repeated
         known, spread = float(self.control["error_q"]), max(self.collected[1].tolist(), default=0.0)
         estimate = SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
-        held = self.capacitance * (self.largest + float(peaks[:, readout.PEAK_U].max()))
+        held = self.capacitance * (self.largest + max(peak[readout.PEAK_U] for peak in peaks))
         moved = max(float(self.control["peak_q"]), *map(abs, self.y[-self.s_before.size :].tolist()))
         # Every step adds the round-off of the charge that is held, and the relative error of the areas' polynomials is
         # also a relative error of all charge moved.
-        missed = max((area_missed(curve, self.decade) for curve in self.curves), default=0.0)
+        missed = self.problem.scene.remember(
+            ("missed", self.decade, self.curves.tobytes()),
+            lambda: max((area_missed(curve, self.decade) for curve in self.curves), default=0.0),
+        )
         run.charge_error = float(self.charge_safety * estimate + 4e-16 * held * steps + missed * (held + moved))
 
     def through(self, sources: Sources, t_end: float) -> Status:
@@ -176,7 +185,7 @@ class Stepping(Integration):
             if code == readout.LOOKED_AT:
                 self._settle()
             elif code == readout.EXCESSIVE:
-                if excess_of(self.stated_peaks()[self.gaps], self.problem.rounding) > self.asked:
+                if excess_of(np.array(self.stated_peaks())[self.gaps], self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
             elif code != readout.DONE:
                 return self.failed(code, sources)
