@@ -96,8 +96,8 @@ def run(
     circuit, start = with_times(job.read(), job.stop, start)
     if circuit.tran is None:
         raise InputError(f"{job.deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
-    how: dict[str, Any] = {"area": area_from_text(area), "start": start, "rtol": job.rtol, "method": method}
-    check_arguments(**how, jumps=jumps)
+    how: dict[str, Any] = {"start": start, "rtol": job.rtol, "method": method, "area": area_from_text(area)}
+    check_arguments(job.rtol, method, start, jumps)
     how |= {"charge_law": job.charge_law, "t_stop": None if job.stop is None else circuit.tran.stop}
     if stream or chunk or signals or netcdf:
         from fingerspice.cli.store import run_streamed

@@ -21,11 +21,11 @@ from fingerspice.circuit.network import Network
 from fingerspice.results.outcome import Plan, SolveError, State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
-from fingerspice.solve.planning import asked, make_plan
+from fingerspice.solve.periodic import asked
 from fingerspice.solve.problem import Problem, at_breakpoints, check_length, check_outputs
 from fingerspice.solve.recordings.run import LaneMarch, LostError, prepared
 from fingerspice.solve.runs import Run
-from fingerspice.solve.simulation import check_arguments, integrated, own_rtol, solution_of, state_error
+from fingerspice.solve.simulation import check_arguments, integrated, make_plan, own_rtol, solution_of, state_error
 from fingerspice.solve.starting import as_shown
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import on_breakpoint
@@ -262,7 +262,7 @@ def stream(
     SolveError
         While iterating, where the run fails; its `solution` holds the outputs after the last chunk.
     """
-    rtol = check_arguments(rtol, method, area, start)
+    rtol = check_arguments(rtol, method, start)
     require(chunk is None or count is None, "count", "given beside chunk", "one of them")
     length = positive_number("chunk", CHUNK if chunk is None else chunk, "s")
     step = None if step is None else positive_number("step", step, "s")
