@@ -10,7 +10,7 @@ import pytest
 import fingerspice as fs
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.devices import DEVICES, DeviceSpec, ParameterSpec, Usual, layer_devices
-from fingerspice.netlist.reader import LIBRARIES, library_text
+from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from fingerspice.physics.materials import EPS0
 from ngspice_tools import run_ngspice
 
@@ -23,7 +23,7 @@ every_layer = pytest.mark.parametrize("name", layer_devices())
 
 def bodies(law: str) -> dict[str, tuple[list[str], dict[str, str]]]:
     """Nodes and parameters with their defaults of each .subckt of a library."""
-    text = re.sub(r"\n\+", " ", library_text(law))
+    text = re.sub(r"\n\+", " ", shipped_text(law))
     out = {}
     for line in re.findall(r"^\.subckt (.*)$", text, re.MULTILINE):
         head, _, parameters = line.partition("params:")

@@ -14,7 +14,7 @@ from commands import Command
 from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import Tran
 from fingerspice.netlist.lexer import decimal_comma
-from fingerspice.netlist.reader import ELSEWHERE, LIBRARIES, library_text
+from fingerspice.netlist.reader import ELSEWHERE, LIBRARIES, shipped_text
 from ngspice_tools import call_ngspice, run_ngspice, with_max_step
 from scenes import DECKS, listed
 
@@ -176,8 +176,8 @@ def test_a_changed_library_beside_the_deck_is_warned_about_for_it_is_not_read(na
     path = tmp_path / "deck.cir"
     path.write_text(edited(("fingerspice.lib", name)))
     for text, expected in (
-        (None, 0), (library_text(law), 0), (library_text(law).replace("\n", "\r\n") + "\r\n", 0),
-        (library_text(law).replace("8.854e-12", "8.9e-12"), 1), ("", 1), ("x" * 10_000_000, 1),
+        (None, 0), (shipped_text(law), 0), (shipped_text(law).replace("\n", "\r\n") + "\r\n", 0),
+        (shipped_text(law).replace("8.854e-12", "8.9e-12"), 1), ("", 1), ("x" * 10_000_000, 1),
     ):  # fmt: skip
         if text is not None:
             (tmp_path / name).write_text(text, newline="")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.netlist.reader import LIBRARIES, library_text
+from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from ngspice_tools import CIRCUITS, call_ngspice, run_ngspice
 from random_decks import NETWORKS, SOURCES
 from random_decks import deck as random_deck
@@ -142,8 +142,8 @@ def test_the_exported_deck_needs_no_other_file(law: str, tmp_path: Path) -> None
     circuit = table1(tran="100u 10m uic")
     text = fs.export_netlist(circuit, charge_law=law)
     assert not re.search(r"^\s*\.(include|inc|lib)\b", text, re.MULTILINE | re.IGNORECASE)
-    assert library_text(law).strip() in text
-    assert library_text("local") != library_text("mobile")
+    assert shipped_text(law).strip() in text
+    assert shipped_text("local") != shipped_text("mobile")
     (tmp_path / "alone.cir").write_text(text)
     done = call_ngspice(tmp_path, "-r", "out.raw", "alone.cir", timeout=20.0)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -152,16 +152,16 @@ def test_the_exported_deck_needs_no_other_file(law: str, tmp_path: Path) -> None
 
 def test_the_charge_law_is_the_decks_own_unless_told() -> None:
     mobile = table1(library="fingerspice_mobile.lib")
-    assert library_text("mobile").strip() in fs.export_netlist(mobile)
-    assert library_text("local").strip() in fs.export_netlist(mobile, charge_law="local")
-    assert library_text("local").strip() in fs.export_netlist(table1())
+    assert shipped_text("mobile").strip() in fs.export_netlist(mobile)
+    assert shipped_text("local").strip() in fs.export_netlist(mobile, charge_law="local")
+    assert shipped_text("local").strip() in fs.export_netlist(table1())
     with pytest.raises(fs.InputError, match=r"charge_law is 'moble'; allowed: 'local' or 'mobile'"):
         fs.export_netlist(mobile, charge_law="moble")
 
 
 def test_the_packages_libraries_are_those_beside_the_decks() -> None:
     for law, name in LIBRARIES.items():
-        assert library_text(law) == (CIRCUITS / name).read_text()
+        assert shipped_text(law) == (CIRCUITS / name).read_text()
 
 
 def test_analyses_start_values_and_the_reading_of_eq_7_go_along() -> None:

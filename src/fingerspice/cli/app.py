@@ -96,8 +96,8 @@ def run(
     circuit, start = with_times(job.read(), job.stop, start)
     if circuit.tran is None:
         raise InputError(f"{job.deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
-    how: dict[str, Any] = {"area": area_from_text(area), "start": start, "rtol": job.rtol, "method": method}
-    check_arguments(**how, jumps=jumps)
+    how: dict[str, Any] = {"start": start, "rtol": job.rtol, "method": method, "area": area_from_text(area)}
+    check_arguments(job.rtol, method, start, jumps)
     how |= {"charge_law": job.charge_law, "t_stop": None if job.stop is None else circuit.tran.stop}
     if stream or chunk or signals or netcdf:
         from fingerspice.cli.store import run_streamed
@@ -233,8 +233,7 @@ def compare(job: Job) -> None:
 
 
 def export(
-    job: Job,
-    output: Annotated[Path, Option("--output", "-o", metavar="FILE", help="The ngspice deck to write.")],
+    job: Job, output: Annotated[Path, Option("--output", "-o", metavar="FILE", help="The ngspice deck to write.")]
 ) -> None:
     """Write DECK as one self-contained ngspice deck: bodies included, parameters folded in.
 
@@ -327,8 +326,7 @@ def figures(
 
 
 def sets(
-    job: Job,
-    name: Annotated[str | None, Argument(metavar="[NAME]", help="A set; without it all are listed.")] = None,
+    job: Job, name: Annotated[str | None, Argument(metavar="[NAME]", help="A set; without it all are listed.")] = None
 ) -> None:
     """List the named sets of parameters, or show the values of one with their ranges and sources.
 
@@ -343,8 +341,7 @@ def sets(
 
 
 def check(
-    job: Job,
-    store: Annotated[Path, Argument(metavar="STORE", help="Folder that run --stream or sweep --store wrote.")],
+    job: Job, store: Annotated[Path, Argument(metavar="STORE", help="Folder that run --stream or sweep --store wrote.")]
 ) -> None:
     """Verify that every chunk of a store is as it was written.
 
@@ -383,9 +380,7 @@ for _function, _options in _COMMANDS.items():
 
 
 @app.callback(invoke_without_command=True)
-def _root(
-    version: Annotated[bool, Option("--version", help="Print the version.", is_eager=True)] = False,
-) -> None:
+def _root(version: Annotated[bool, Option("--version", help="Print the version.", is_eager=True)] = False) -> None:
     if version:
         say(f"fingerspice {fs.__version__}")
         raise typer.Exit

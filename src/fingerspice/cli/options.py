@@ -397,6 +397,5 @@ def _texts_in(file: Path) -> dict[str, Any]:
         # `design` writes NAME_drive.wav, NAME_drive.csv and NAME_friction.csv with the picture NAME_design.png.
         picture = file.with_name(f"{file.stem.rpartition('_')[0]}_design.png")
     with Image.open(picture) as image:
-        image.load()
         text: dict[str, Any] = dict(getattr(image, "text", {}))
     return text if file.name in json.loads(text.get("files", "[]")) else {}

@@ -15,6 +15,7 @@ import fingerspice as fs
 from fingerspice.base.announcing import paced
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
+from fingerspice.base.pages import Table
 from fingerspice.cli.options import Job, Makes, number
 from fingerspice.waveforms.waveform import refuse, require
 
@@ -221,9 +222,9 @@ def _told(answer: dict[str, Any], found: Any) -> str:
 
     rows = summary(found)
     answer.update(figures=rows, failed=int((found.status >= 2).sum()))
-    line = "{output:<24}{unit:<8}{p5:>12.4g}{median:>12.4g}{p95:>12.4g}{mean:>12.4g}"
-    head = f"{'output':<24}{'unit':<8}{'5 %':>12}{'median':>12}{'95 %':>12}{'mean':>12}"
-    return "\n".join([head, *(line.format(**row) for row in rows)])
+    keys = {"5 %": "p5", "median": "median", "95 %": "p95", "mean": "mean"}
+    cells = [(f"{row['output']}", f"{row['unit']}", *(f"{row[key]:.4g}" for key in keys.values())) for row in rows]
+    return Table(("output", "unit", *keys), cells, left=2).text()
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Path]:
@@ -283,7 +284,7 @@ def _parameter(path: str, one: Any) -> Any:
 def _shared(rows: list[dict[str, Any]], output: str) -> str:
     """Total indices as text: a line for each place, a column for each parameter, and what is largest where."""
     names = sorted({row["parameter"] for row in rows}, key=str.lower)
-    lines, first = [["", *names]], dict[str, list[str]]()
+    lines, first = list[tuple[str, ...]](), dict[str, list[str]]()
     # The rows of a place stand together, the largest index first.
     for i in range(0, len(rows), len(names)):
         # A number, or the name of a set.
@@ -291,13 +292,10 @@ def _shared(rows: list[dict[str, Any]], output: str) -> str:
         place = ", ".join(f"{name} = {x if isinstance(x, str) else f'{x:.4g}'}" for name, x in values)
         first.setdefault(rows[i]["parameter"], []).append(place)
         told = {row["parameter"]: "{total:.2f} ({low:.2f}-{high:.2f})".format(**row) for row in rows[i:][: len(names)]}
-        lines.append([place, *(told[name] for name in names)])
-    wide = max(len(place) for place, *_ in lines)
-    widths = [f"<{wide + 2 if wide else 0}", *(f">{max(len(name), 16) + 2}" for name in names)]
-    table = ["".join(map(format, line, widths)) for line in lines]
+        lines.append((place, *(told[name] for name in names)))
     most = "; ".join(
         name + ("" if len(first) == 1 else f" ({places[0]}{f' to {places[-1]}' if len(places) > 1 else ''})")
         for name, places in first.items()
     )
     title = f"share of the variance of {output} that comes from a parameter, its interactions included (95 % interval)"
-    return "\n".join([title, *table, f"largest share: {most}"])
+    return "\n".join([title, Table(("", *names), lines).text(), f"largest share: {most}"])

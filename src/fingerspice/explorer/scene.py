@@ -395,10 +395,7 @@ def shown_runs(folder: Path) -> dict[str, Callable[[], fs.Solution]]:
         return fs.simulate(fs.read_netlist(path))
 
     def example(request: dict[str, Any]) -> fs.Solution:
-        asked = Asked(request)
-        first, stop, _ = asked.times
-        t = np.linspace(first, stop, 4001)
-        return fs.simulate(asked.circuit, t_stop=stop, t_eval=t, charge_law=asked.charge_law, throw=False)
+        return _shown(Asked(request))
 
     decks = {path.stem: partial(deck, path) for path in sorted(folder.glob("*.cir"))}
     return {**decks, **{f"scene-{one['name']}": partial(example, one["request"]) for one in EXAMPLES}}

@@ -29,7 +29,7 @@ from fingerspice.waveforms.waveform import require
 
 ADDRESS = "127.0.0.1"
 FRAME_HEIGHT, MOST_FRAMES = 900, 8  # Height (px) of the page in a notebook; explorers that one notebook keeps running
-MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32  # Bytes of a request; s of silence; connections at once
+MOST_BYTES, SILENCE = 5_000_000, 30.0  # Bytes of a request; s of silence on a connection
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 #: Pages that may show the explorer within them, where a notebook has asked for it: those of this computer.
 _NOTEBOOKS = " ".join(f"{kind}://{host}:*" for kind in ("http", "https") for host in (ADDRESS, "localhost"))
@@ -252,23 +252,9 @@ def static_page(circuit: fs.Circuit | None = None) -> str:
 
 
 class _Server(ThreadingHTTPServer):
-    """A server with a bounded number of connections, which says nothing about those that break."""
+    """A server that says nothing about connections that break."""
 
-    daemon_threads = True
     block_on_close = False
-
-    def __init__(self, *arguments: Any) -> None:
-        self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        super().__init__(*arguments)
-
-    def verify_request(self, request: Any, client_address: Any) -> bool:
-        return self._room.acquire(blocking=False)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that is closed breaks its connections: no error of ours."""

@@ -35,9 +35,9 @@ MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30  #: Of a file, and of all the fi
 
 
 @cache
-def library_text(law: str) -> str:
-    """Text of a charge law's library, from the installed package or the source tree."""
-    name = LIBRARIES[law]
+def shipped_text(name: str) -> str:
+    """Text of a charge law's library, or of a file of `circuits`, from the installed package or the source tree."""
+    name = LIBRARIES.get(name, name)
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "lib", package.parents[1] / "circuits"):
         if (path := folder / name).is_file():
@@ -126,7 +126,7 @@ def library_changed(root: Path, folder: Path, name: str) -> bool:
         path = (folder / name.replace("\\", "/")).resolve()
         if not path.is_relative_to(root) or not path.is_file():
             return False
-        own = library_text(next(law for law, file in LIBRARIES.items() if file == path.name.lower()))
+        own = shipped_text(path.name.lower())
         lines = ([line.rstrip() for line in lexer.split_lines(x.rstrip())] for x in (read_text(path, name), own))
         return next(lines) != next(lines)
     except (OSError, ValueError, RuntimeError):

@@ -19,7 +19,7 @@ from fingerspice.base.files import write_aside
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Figure
 
     from fingerspice.plots.picture import Picture as Picture
 
@@ -48,8 +48,8 @@ def new_figure(rows: int, columns: int = 1, height: float = 3.0, **options: Any)
     return figure, axes
 
 
-def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
-    """Set the labels of a panel, a light grid, and no box around it."""
+def dress(ax: Axes, ylabel: str = "", xlabel: str = "", **options: Any) -> None:
+    """Set the labels of a panel, a light grid, no box around it, and `options` of ``Axes.set``: scales and limits."""
     if ylabel:
         ax.set_ylabel(ylabel, fontsize=FONT)
     if xlabel:
@@ -59,6 +59,7 @@ def dress(ax: Axes, ylabel: str = "", xlabel: str = "") -> None:
     ax.spines[["left", "bottom"]].set_color("#999999")
     ax.grid(True, color="#E4E4E4", linewidth=0.6)
     ax.set_axisbelow(True)
+    ax.set(**options)
 
 
 def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool = False) -> None:

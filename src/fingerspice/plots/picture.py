@@ -145,8 +145,7 @@ def _along(
             ax.plot(x, middle, color=drawing.CYCLE[0], linewidth=1.3, label=name)
         if indices is not None:
             _alone(ax, x, factor * indices[f"{output}_alone"].values[:, j], indices, j)
-        ax.set_ylim(bottom=min(0.0, float(np.nanmin(values))))
-        drawing.dress(ax, label if j % columns == 0 else "")
+        drawing.dress(ax, label if j % columns == 0 else "", ylim=(min(0.0, float(np.nanmin(values))), None))
     told = axes[0].get_legend_handles_labels()
     if len(told[0]) > 1:
         figure.legend(*told, loc="outside upper center", ncols=len(told[0]), fontsize=drawing.FONT, frameon=False)
@@ -194,8 +193,7 @@ def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> No
         else:
             off = [[max(total[j] - low[j], 0.0)], [max(high[j] - total[j], 0.0)]]
             ax.bar([name], [total[j]], yerr=off, color=color, capsize=2.0)
-    drawing.dress(ax, "share of variance")
-    ax.set_ylim(0.0, max(1.05, float(np.max(high))))
+    drawing.dress(ax, "share of variance", ylim=(0.0, max(1.05, float(np.max(high)))))
     if x is not None:
         drawing.legend_within(ax, 44)
 

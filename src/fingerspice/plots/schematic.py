@@ -14,10 +14,11 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import image, rc_context
+from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Rectangle
 
@@ -27,9 +28,6 @@ from fingerspice.circuit.describe import waveform_text
 from fingerspice.plots import drawing
 from fingerspice.plots.picture import Picture
 from fingerspice.waveforms.waveform import refuse
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _GROUND = "0"
 

@@ -72,8 +72,8 @@ def plot_solution(solution: Solution, signals: Any = None, window: Any = None, o
     columns = [axes[k :: len(spans)] for k in range(len(spans))]
     for keys, first, *enlarged in zip(panels, *columns, strict=True):
         traces, factor, unit = draw_panel(first, runs, keys, start, stop, marks if dense else None)
-        last = enlarged[0] if zoomed is not None else first
-        for trace in traces if zoomed is not None else ():
+        last = (first, *enlarged)[-1]
+        for trace in traces if enlarged else ():
             _draw_line(last, trace._replace(label="_"), factor, *spans[-1], time_unit(runs)[0])
         if keys == ["f_el"] and len(traces) == 1:
             mean, of = traces[0].solution.f_el_mean_periodic, "the last period"
@@ -400,8 +400,7 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     one, nodes = results[0], results[0].nodes
     low, high = float(one.frequency.min()), float(one.frequency.max())
     figure, axes = drawing.new_figure(2, 1 if nodes else 2, height=4.6, sharex=True)
-    forces = np.concatenate([r.f_el_mean for r in results])
-    factor, unit = drawing.engineering(drawing.peak_of(forces[np.isfinite(forces)]), "N", 0.05)
+    factor, unit = drawing.engineering(drawing.peak_of(np.nan_to_num([r.f_el_mean for r in results])), "N", 0.05)
     for number, r in enumerate(results):
         order, v = np.argsort(r.frequency), np.asarray(r.v_nodes)
         style: dict[str, Any] = {"label": nodes} if nodes else {
@@ -418,8 +417,7 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
         for ax, (values, label, color) in zip(axes, panels, strict=True):
             marker = "o" if order.size < 12 else ""
             ax.plot(r.frequency[order], values[order], color=color, linewidth=1.5, marker=marker, **style)
-            drawing.dress(ax, label)
-            ax.set_xscale("log")
+            drawing.dress(ax, label, "Frequency [Hz]" if ax in axes[-len(axes) // 2 :] else "", xscale="log")
     how = f"source amplitude {f'{one.amplitude:.4g} V' if np.isfinite(one.amplitude) else 'no fundamental'}"
     how = one.drive if nodes else how if len(results) == 1 else "several source amplitudes"
     if nodes:
@@ -442,8 +440,6 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     spans = [(a, b) for a, b in outside if b > a]
     for (a, b), ax in itertools.product(spans, axes):
         ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
-    for ax in axes[-len(axes) // 2 :]:
-        ax.set_xlabel("Frequency [Hz]", fontsize=drawing.FONT)
     shaded = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
     drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, shaded) if p))
     return figure

@@ -68,9 +68,10 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
             rows, z_end = np.hstack([rows, z[:-1], current[:-1]]), z[-1]
     state = State(end, np.append(x_end, z_end), s_end, np.zeros(area.size), scene.charge_law)
     status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
-    run = Run(problem.t_out[: len(rows)], problem.left[: len(rows)], rows, status, 0, {}, state)
-    run.t_failed, run.unseen, run.rough = tables.not_finite, tables.unseen, tables.rough
-    run.charge_error = charge_error
+    run = Run(
+        problem.t_out[: len(rows)], problem.left[: len(rows)], rows, status, 0, {}, state, charge_error=charge_error,
+        t_failed=tables.not_finite, unseen=tables.unseen, rough=tables.rough,
+    )  # fmt: skip
     _state_errors(problem, run, bound)
     if not problem.network.waveform.is_sampled:
         # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
@@ -84,9 +85,7 @@ def _along(matrix: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kj,tj->tk", matrix, values))
 
 
-def _answer(
-    problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray
-) -> tuple[list[FloatArray], float]:  # fmt: skip
+def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray) -> tuple[list[FloatArray], float]:
     """Modes (n_t, n), and sources, their integrals and slopes (n_t, n_s), at the outputs reached; and an end, s.
 
     The last row is the left-hand response at the end of the windows.
@@ -167,8 +166,8 @@ def _state_errors(problem: Problem, run: Run, bound: float) -> None:
             force = float(record.fingers[i][1].stress(peak) * record.net.area0[place])
         else:
             force = float(record.each("f_el")[i].max(initial=0.0))
-        share = rounding / peak if peak > 0.0 else 0.0
-        gaps.append((peak, force, rounding + bound * peak, (2.0 * share + 3.0 * bound) * force))
+        share = 2.0 * rounding / (peak or math.inf) + 3.0 * bound
+        gaps.append((peak, force, rounding + bound * peak, share * force))
     if not gaps:
         peak = max((float(np.abs(u).max(initial=0.0)) for u, _ in gap_signals(record)), default=0.0)
         gaps = [(peak, 0.0, rounding + bound * peak, 0.0)]
@@ -280,9 +279,8 @@ class _Path(NamedTuple):
 def _ahead(problem: Problem, run: Run, rtol: float) -> tuple[bool, _Path | None]:
     """Whether a run that stopped reaches a fold, and the path to it where it is not there already."""
     model, t, (y, u) = model_of(problem.scene), run.state.t, to_loop(problem.scene, run.state)
-    windows = list(Tables(problem, FINEST_RTOL))
-    window = next((one for one in windows if one[0].edges[-1] > t), windows[-1])
-    sources = joined(window)
+    windows = list(map(joined, Tables(problem, FINEST_RTOL)))
+    sources = next((one for one in windows if one.edges[-1] > t), windows[-1])
     (u_source,), (slope,) = values_at(sources, t)
     if t in sources.edges:
         u = float(ramp(model, model.k_gap * u_source, dot(model.gap, y), u))

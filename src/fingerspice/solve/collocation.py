@@ -29,7 +29,7 @@ from fingerspice.engine.one_area import system as systems
 from fingerspice.engine.one_area.model import Model, dot, gap_voltage
 from fingerspice.engine.one_area.rows import Work, new_stack_work
 from fingerspice.engine.one_area.step import OneArea
-from fingerspice.engine.one_area.system import LEVEL_RATIO, System, area_error, area_missed
+from fingerspice.engine.one_area.system import LEVEL_RATIO, System, area_error
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import LawContact, inverse_area_range, inverse_areas
 from fingerspice.results.outcome import State, Status
@@ -69,9 +69,7 @@ def scratch_of(system: System) -> tuple[StepTables, Work]:
     return tables, work
 
 
-def system_of(
-    scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO, u_peak: float = 0.0
-) -> System:  # fmt: skip
+def system_of(scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO, u_peak: float = 0.0) -> System:
     """The modal system of a scene for tolerances of a decade, with neighbouring reference areas in at most `ratio`.
 
     The area curve reaches `u_top` (V) and the reference areas `u_peak` (V) if these are above 0.
@@ -95,15 +93,11 @@ class Track(Stepping):
     """
 
     def __init__(self, problem: Problem, rtol: float, tol: float, top: float = 0.0) -> None:
-        scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
-
-        def make() -> tuple[System, float]:
-            system = system_of(scene, decade, top)
-            return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
-
+        scene = problem.scene
+        self.decade = decade = int(np.floor(np.log10(rtol)))
         # Similar runs share a system: there is one for each decade of tolerances, of up to 1 MB.
-        self.system, self.area_error = scene.remember(("system", decade, top), make)
-        model, shown = self.system.model, scene.shown.turn.size
+        self.system = scene.remember(("system", decade, top), lambda: system_of(scene, decade, top))
+        self.curves, model, shown = self.system.model.curve[None], self.system.model, scene.shown.turn.size
         self.rates, self.n_error = self.system.rates, problem.initial.y.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
         self.capacitance = float(model.slow[-3]) * model.area0  # Of the layer through which the charge is computed
@@ -145,9 +139,7 @@ class Track(Stepping):
         return from_loop(self.problem.scene, self.t, self.y, before, u_gap)
 
     def jump(self, after: FloatArray) -> bool:
-        met = enter(
-            self.system.model, self.pace.charge, float(after[0]), self.y, self.control, self.sign, self.branch
-        )  # fmt: skip
+        met = enter(self.system.model, self.pace.charge, float(after[0]), self.y, self.control, self.sign, self.branch)
         self.control["u_before"] = after[0]
         return bool(met)
 
@@ -183,7 +175,7 @@ class Known:
     def __init__(self, scene: Scene, decade: int) -> None:
         n_area, (numbers, magnified, self.shapes) = scene.net.area0.size, self._referred(scene, scene.net.area0)
         counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
-        room = max(2, min(MOST_REFERENCES, MOST_NUMBERS // numbers.size))
+        room = max(3, min(MOST_REFERENCES, MOST_NUMBERS // numbers.size))
         # Memory that no reference has been written to yet costs nothing.
         self.arrays = References(np.empty((room, n_area), np.int64), np.empty((room, numbers.size)), *counts)
         self.tables = new_tables(self.shapes[0][0])
@@ -226,15 +218,6 @@ class Known:
         numbers[:] = self.arrays.numbers[0]
         parts: dict[str, Any] = dict(zip(REFERRED, views, strict=True))
         return Form(numbers=numbers, **parts, **self.fixed)
-
-
-def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
-    """The references of a scene for tolerances of a decade."""
-    # Each thread has its own set, because compiled code writes into the tables.
-    key = ("references", decade, threading.get_ident())
-    if anew:
-        scene.kept.pop(key, None)
-    return scene.remember(key, lambda: Known(scene, decade))
 
 
 def _fed(scene: Scene) -> IntArray:
@@ -298,20 +281,17 @@ class March(Stepping):
         scene, size = problem.scene, problem.initial.y.size
         n_s, n_area = len(scene.network.waveforms), scene.net.gap.size
         self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
-        self.gaps, self.largest = list(scene.network.fingers), u_scale
-        self.area_error = max((area_missed(curve, self.decade) for curve in scene.net.curves), default=0.0)
+        self.gaps, self.largest, self.curves = list(scene.network.fingers), u_scale, scene.net.curves
         self.capacitance = float(problem.network.capacitance(scene.net.area0).sum())
         self.n_error = size - n_s
         super().__init__(problem, tol * u_scale, size - n_s, size + n_s if problem.charge else size)
         self.shortest = problem.network.waveform.shortest_time()
-        self.references = known_references(scene, self.decade)
+        # Each thread has its own set, because compiled code writes into the tables.
+        key = ("references", self.decade, threading.get_ident())
+        self.references = scene.remember(key, lambda: Known(scene, self.decade))
         self.form = self.references.form()
         self.rates, self.held, cells = self.form.rates, held(self.form), self.form.c.size
         self.work = new_network_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
-
-    def begin(self, initial: State, tol: float) -> None:
-        super().begin(initial, tol)
-        self.control["magnified"] = 1.0
 
     @property
     def rounding(self) -> list[float]:
@@ -340,9 +320,9 @@ class March(Stepping):
             scene, known, at = self.problem.scene, self.references, self.work.at
             wanted = tuple(map(int, known.arrays.wanted))
             if known.arrays.used[0] == len(known.arrays.levels):
-                # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
+                # Start the set anew with the reference in use; the tables and couplings of all others are dropped.
                 levels = tuple(map(int, known.arrays.levels[at[0]]))
-                self.references = known = known_references(scene, self.decade, anew=True)
+                known.arrays.used[0], known.tables.used[:] = 1, 0
                 if any(levels):
                     known.add(scene, levels)
                 at[0] = known.arrays.used[0] - 1

@@ -29,7 +29,7 @@ from fingerspice.numerics.modes import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.results.solution import DERIVED, MEANS, SampleGradient, Sensitivity, Solution
-from fingerspice.solve.planning import asked
+from fingerspice.solve.periodic import asked
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block, driving, ready
 from fingerspice.waveforms.samples import Samples, as_samples
@@ -299,13 +299,11 @@ class _Intervals:
             begun = [form.start(_problem(self.run, {self.name: one})) for one in moved]
             of_source[:, 0] += after @ derivative([start[:m] for start, _ in begun], step)
         # Samples before the times, and how far these are beyond, in samples.
-        out, place = np.zeros((2, wave.count)), np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)
+        place = np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)
         first = np.minimum(np.floor(place + 1e-6), wave.count - 2.0).astype(np.int64)
         beyond = np.maximum(place - first, 0.0)
-        for samples, found in zip(out, of_source, strict=True):
-            np.add.at(samples, first, (1.0 - beyond) * found)
-            np.add.at(samples, np.minimum(first + 1, wave.count - 1), beyond * found)
-        return out
+        at, shares = np.append(first, first + 1), np.append(1.0 - beyond, beyond)
+        return np.array([np.bincount(at, shares * np.tile(found, 2), wave.count) for found in of_source])
 
 
 def _problem(run: Solution, sources: dict[str, Waveform]) -> Problem:

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -171,46 +172,45 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
     finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
     tol, nfev, folded = max(LOCAL_SHARE * rtol, finest), 0, math.inf
-    nearest: tuple[float, Run] | None = None
+    folds: list[tuple[float, Run]] = []
     for attempt in range(ATTEMPTS):
-        taken = tol
+        last = tol <= finest or attempt == ATTEMPTS - 1
         beside = _integrate(compared, coarse, BESIDE * tol, u_scale, progress)
         run = _integrate(probing, fine, tol, u_scale, progress)
         nfev += beside.nfev + run.nfev
         run.nfev = nfev
         worst = _stated(problem, run, run.only(probed), beside, u_scale, ALIKE * tol) / rtol
-        last = tol <= finest or attempt == ATTEMPTS - 1
+        finer = 0.03
         if mobile and run.record(problem).fold_margin.min(initial=1.0) < runs.PAST_FOLD:
             # A step has crossed a fold onto a branch of the area equation that no continuous path reaches.
-            tol, run.status = max(0.03 * tol, finest), Status.ERROR_NOT_MET
+            run.status = Status.ERROR_NOT_MET
         elif run.status is Status.FOLD and run.t_failed is not None:
             # The error of the state shifts the fold: reduce the tolerance until the fold's time no longer moves.
             moved, folded = abs(run.t_failed - folded), run.t_failed
-            if nearest is None or moved < nearest[0]:
-                nearest = moved, run
-            if moved <= FOLD_TIME * folded:
-                break
-            tol = max(0.03 * tol, finest)
+            folds.append((moved, run))
+            last |= moved <= FOLD_TIME * folded
         elif run.status is not Status.SUCCESS or (worst <= 1.0 and beside.status is not Status.FOLD):
             break
         else:
             # Also where the coarser run alone has met a fold. Rounding of the nodes' voltages may be too large, too.
             last |= 0.0 < rtol * run.gaps[:, 0].max(initial=0.0) < ROUNDED * u_scale
             run.status = Status.ERROR_NOT_MET if last else run.status
-            tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), finest)
+            finer = min(0.3, 0.5 / worst if worst > 0.0 else 0.3)
         if last:
             break
+        tol = max(finer * tol, finest)
     span = max(folded, min(problem.network.waveform.shortest_time(), problem.t_stop - problem.t_start))
-    believed = nearest is not None and nearest[0] <= FOLD_SPREAD * span
-    if nearest is not None and (run.status is Status.FOLD or (believed and run.status is not Status.SUCCESS)):
-        # Round-off may dominate at the finest tolerances: take the run whose fold differs least from its predecessor's.
-        run = nearest[1]
+    # Round-off may dominate at the finest tolerances: take the run whose fold differs least from its predecessor's.
+    moved, nearest = min(folds, key=itemgetter(0), default=(math.nan, run))
+    believed = moved <= FOLD_SPREAD * span
+    if run.status is Status.FOLD or (believed and run.status is not Status.SUCCESS):
+        run = nearest
         run.status, run.nfev = Status.FOLD if believed else Status.ERROR_NOT_MET, nfev
     margin = float(run.record(problem).fold_margin.min(initial=1.0)) if mobile else run.margin
     run = run.only(~probed)
     run.end_where_it_stopped()
     run.margin = min(margin, float(run.record(problem).fold_margin[-1])) if mobile and run.t.size else margin
-    again = partial(_integrate, method=fine, tol=taken, u_scale=u_scale)
+    again = partial(_integrate, method=fine, tol=tol, u_scale=u_scale)
     run.continuous = closed_form(problem, again, _BETWEEN * excess_of(run.gaps, problem.rounding))
     run.note = f"{reason}; implicit steps took over, {run.stats['steps']} of them" if reason else ""
     return run
@@ -293,6 +293,7 @@ _QUIET = threading.Lock()
 SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 _TORCH_ORDER = {"rk4": 4, "midpoint": 2, "euler": 1}  # Of those with fixed steps
 TORCH_METHODS = ("dopri5", "dopri8", "bosh3", "adaptive_heun", *_TORCH_ORDER)
+FOREIGN = {"scipy": SCIPY_METHODS, "torchdiffeq": TORCH_METHODS}  #: Methods of the libraries
 # Tolerances of our own run and of the library's first run, relative to the error asked for.
 REFERENCE, FIRST = 0.03, 0.1
 Rate = Callable[[float, FloatArray], FloatArray]
@@ -400,11 +401,7 @@ class Foreign(Collocation):
 
 def solve_foreign(problem: Problem, method: str, rtol: float, progress: Progress | None = None) -> Run:
     """Integrate with a library's method until the error against our own Radau is within `rtol` of the peaks."""
-    library, _, name = method.partition(":")
-    known = SCIPY_METHODS if library == "scipy" else TORCH_METHODS
-    if name not in known:
-        raise InputError(f"unknown method '{method}'; allowed: {', '.join(f'{library}:{m}' for m in known)}")
-    if library == "torchdiffeq" and not all(map(find_spec, ("torch", "torchdiffeq"))):
+    if method.startswith("torchdiffeq:") and not all(map(find_spec, ("torch", "torchdiffeq"))):
         raise InputError(f"method '{method}' needs torchdiffeq; pip install 'fingerspice[torch]'")
     reference = solve_coupled(problem, max(REFERENCE * rtol, 1e-13))
     ours, u_scale = reference.record(problem), float(reference.gaps[:, 0].max(initial=0.0)) or 1.0

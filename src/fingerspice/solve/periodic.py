@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.base.errors import InputError
+from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.network import Modes
 from fingerspice.engine.collocation import readout
 from fingerspice.numerics import linear
@@ -23,11 +24,11 @@ from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.collocation import GUESS, March, Track, stepping
 from fingerspice.solve.nodal import pass_through
-from fingerspice.solve.problem import Problem, joined
+from fingerspice.solve.problem import Problem, joined, prepare, to_ends
 from fingerspice.solve.runs import no_period
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
 from fingerspice.waveforms.sampling import source_table
-from fingerspice.waveforms.waveform import OFF, Waveform
+from fingerspice.waveforms.waveform import OFF, Waveform, require
 
 # Number of equidistant times of a period from which the mean of an area with a time constant is computed.
 SAMPLES = 64
@@ -94,15 +95,14 @@ class Period:
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
         key = "period", self.begin, self.span, problem.step if waveform.is_sampled else 0.0
-        end = self.begin + self.span
+        self.end = self.begin + self.span
         self.tables = scene.remember(key, lambda: [
-            source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.network.waveforms
+            source_table(w, self.begin, self.end, 1e-13, problem.step) for w in scene.network.waveforms
         ], MOST_PERIODS)  # fmt: skip
         broken = [table.not_finite for table in self.tables if table.not_finite is not None]
         if broken:
             raise no_period(problem, Status.SOURCE_NOT_FINITE, min(broken))
         self.sources = joined(self.tables)
-        self.end = float(min(table.edges[-1] for table in self.tables))
         if pushed and self.begin > problem.t_start:
             # Add the charge that sources drive into the neutral modes between the run's start and the period.
             for j, wave in enumerate(scene.network.waveforms):
@@ -449,3 +449,15 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Period]:
         initial=dataclasses.replace(period.problem.initial, y=y), begun=period.gap_errors,
     )  # fmt: skip
     return started, period
+
+
+def asked(circuit: Circuit, *, rtol: float, t_eval: FloatArray | None = None, **how: Any) -> Problem:
+    """The problem that a call of `simulate` asks for, with arguments as `check_arguments` leaves them."""
+    problem = prepare(circuit, t_eval=t_eval, rtol=rtol, **how)
+    if problem.start == "periodic":
+        problem, _ = close_period(problem, 0.5 * rtol)
+        if t_eval is not None:
+            to_ends(t_eval, problem.t_start, problem.t_stop)
+            allowed = f"from {problem.t_start:g} s on, where the source has settled and its periodic state exists"
+            require(t_eval[0] >= problem.t_start, "the first of t_eval", f"{t_eval[0]:g} s", allowed)
+    return problem

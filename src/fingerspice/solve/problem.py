@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -35,8 +35,8 @@ MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9
 MOST_BYTES = 2e9
 # Round-off of a gap voltage relative to the voltages that cancel in it; finer steps cannot reduce the error below that.
 ROUNDING = 2e-14
-# Largest number of times (0.3 MB) that are cached with a waveform, and of breakpoints in memory.
-KEPT, _BREAKPOINTS_AT_ONCE = 32_768, 65_536
+# Largest number of breakpoints in memory.
+_BREAKPOINTS_AT_ONCE = 65_536
 # Resolution of a time in units of its rounding error; a difference of a source's two limits at an edge is no jump if
 # the source changes as much within this resolution beside the edge.
 _RESOLVED = 8.0
@@ -100,16 +100,9 @@ class Problem:
         return (t - self.t_start) / (self.t_stop - self.t_start)
 
     def breakpoints(self) -> FloatArray:
-        """The sources' breakpoints in the run, s."""
-        return self.kept("breakpoints", lambda: self.network.waveform.breakpoints(self.t_start, self.t_stop))
-
-    def kept(self, what: str, make: Callable[[], FloatArray], *how: Any) -> FloatArray:
-        """Times that follow from the sources and the run; the waveform caches them if they are few."""
-        wave, key = self.network.waveform, (what, self.t_start, self.t_stop, *how)
-        found = wave.remember(key, make, 1)
-        if found.size > KEPT:
-            wave.kept.pop(key, None)
-        return found
+        """The sources' breakpoints in the run, s, kept for the last run."""
+        wave, span = self.network.waveform, (self.t_start, self.t_stop)
+        return wave.remember(("breakpoints", *span), lambda: wave.breakpoints(*span), 1)
 
     def longest_step(self, share: float, start: float, stop: float) -> float:
         """Longest step (s) between two times (s): a share of the shortest time there, and what the deck allows."""
@@ -203,10 +196,8 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
         return t
     span, moved = (problem.t_start, problem.t_stop), t
     windows = 1 + int((span[1] - span[0]) * problem.network.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
-    for w0, w1 in itertools.pairwise(span if windows == 1 else np.linspace(*span, windows + 1)):
+    for w0, w1 in itertools.pairwise(np.linspace(*span, windows + 1)):
         edges = problem.breakpoints() if windows == 1 else problem.network.waveform.breakpoints(w0, w1)
-        if not edges.size:
-            continue
         reach = same_time(1.0) * np.abs(edges)
         first = t.searchsorted(edges - reach)
         near = np.flatnonzero(np.abs(t.take(first, mode="clip") - edges) <= reach)
@@ -223,7 +214,8 @@ def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[
     if t_eval is not None:
         return t_eval, np.zeros(t_eval.size, bool)
     check_outputs(problem.circuit, (problem.t_stop - problem.first) / problem.step)
-    t_out = problem.kept("outputs", lambda: _output_times(problem, jumps), problem.first, problem.step, jumps)
+    key = "outputs", problem.t_start, problem.t_stop, problem.first, problem.step, jumps
+    t_out = problem.network.waveform.remember(key, lambda: _output_times(problem, jumps), 1)
     # Check again, because each jump adds two outputs, of which the first is left-hand.
     check_outputs(problem.circuit, t_out.size)
     left = np.zeros(t_out.size, bool)

@@ -1,7 +1,8 @@
-"""What integrators share: the loop over windows, the end of a run, stated errors, and what to say of a failure."""
+"""What integrators share: the loop over windows, the end of a run, stated errors; and what to say of how it went."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -11,18 +12,32 @@ from typing import Literal
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
+from fingerspice.base.errors import InputError
+from fingerspice.base.units import format_si
+from fingerspice.circuit.describe import circuit_warnings, course_warnings, spectrum_warning
+from fingerspice.circuit.devices import beyond_fingers
+from fingerspice.circuit.statespace import driving
 from fingerspice.engine.collocation.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
 from fingerspice.engine.network import Sources, rates_at
+from fingerspice.physics.contact import LawContact, inverse_area
 from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, State, Status, last_tried
 from fingerspice.results.record import Record
 from fingerspice.results.steps import ClosedForm, Recorded
-from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, values_at
-from fingerspice.waveforms.sampling import breakpoints_at
+from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, shortest_event, values_at
+from fingerspice.waveforms.sampling import Function, breakpoints_at
+from fingerspice.waveforms.waveform import DOUBLE
 
 Progress = Callable[[float], None]
 
 # A distance to the fold below this means that the run has stepped over a fold: at the fold it is 0 to rounding.
 PAST_FOLD = -0.01
+BREAKDOWN_VOLTAGE = 300.0
+LEAST_AREA = 0.2  # Smallest contact area without a warning, relative to the area at 0 V
+# Smallest distance to the fold of the mobile law without a warning: a voltage a few percent larger reaches the fold.
+NEAR_FOLD = 0.2
+# Shortest event (s) in a user's function that may be missed without a warning, half a period of 10 kHz: drives of a
+# screen have few that are shorter.
+_EVENT = 0.5 / 10e3
 # Smallest force (N) whose error is judged; the error of a smaller one may be a denormal number with too few digits.
 LEAST_FORCE = 1e-290
 ROUGH = "the source function itself is rough by {:.2g} V"
@@ -82,15 +97,19 @@ class Run:
             self.rows = np.vstack([self.rows, row])
 
     def add_error(self, u_gap: FloatArray | float, f_el: FloatArray | None = None) -> None:
-        """Add errors that the method does not estimate, V and N; by default f_el follows from u_gap, as F ~ u^2."""
-        gaps = self.gaps.copy()
+        """Add errors that the method does not estimate, V and N, as in `with_error`."""
+        self.gaps = with_error(self.gaps, u_gap, f_el)
         if self.node_error is not None:
             self.node_error += float(np.max(u_gap, initial=0.0))
-        if f_el is None:
-            f_el = 2.0 * u_gap * gaps[:, 1] / np.where(gaps[:, 0] > 0.0, gaps[:, 0], np.inf)
-        gaps[:, 2] += u_gap
-        gaps[:, 3] += f_el
-        self.gaps = gaps
+
+
+def with_error(gaps: FloatArray, u_gap: FloatArray | float, f_el: FloatArray | None = None) -> FloatArray:
+    """`Run.gaps` with more errors, V and N; by default f_el follows from u_gap, as F ~ u^2 A and A falls with u."""
+    out = gaps.copy()
+    out[:, 2] += u_gap
+    # Without a voltage there is no force either.
+    out[:, 3] += 2.0 * u_gap * out[:, 1] / np.maximum(out[:, 0], LEAST_FORCE) if f_el is None else f_el
+    return out
 
 
 def excess_of(gaps: FloatArray, rounding: float) -> float:
@@ -277,5 +296,73 @@ def _concerned(problem: Problem, status: Status, t: float | None) -> list[str]:
 
 def _written(problem: Problem, place: int) -> list[str]:
     """Names of the deck's sources that are combined in source number `place` of the network."""
-    stack = problem.network.stack
-    return [problem.network.sources[place].name] if stack is None else [e.name for e, _ in stack.sources]
+    drives = problem.network.drives
+    return [e.name for e, _ in (drives if problem.network.inner else drives[place : place + 1])]
+
+
+def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
+    """Warnings for every limit of the model that the run exceeds."""
+    success, several, net = run.status is Status.SUCCESS, len(record.fingers) > 1, problem.scene.net
+    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
+    key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
+    yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
+    waves = problem.network.waveforms
+    off = problem.scene.u_peak == 0.0 and success and waves and not run.gaps[:, 0].any()
+    if off and not any(wave.peak(problem.t_start, problem.t_stop) for wave in waves[problem.network.n_voltage :]):
+        if small := ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None):
+            alone = f"{small} has AC alone, which drives sweeps (fingerspice ac)"
+            yield f"the sources are 0 all the time: {alone}; a sine in time is SIN(VO VA FREQ)"
+        elif not problem.initial.y.any() and not any(problem.t_stop <= wave.course[0] < math.inf for wave in waves):
+            yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"
+    if run.note and success:
+        yield run.note
+    for finger, (name, contact) in enumerate(record.fingers):
+        u_peak, f_peak, u_error, _ = run.gaps[finger].tolist()
+        where, i = f" of {name}" if several else "", problem.network.fingers[finger]
+        unloaded = least = largest = float(net.area0[i])
+        if net.slow[i] >= 0:
+            area = record.each("area")[finger]
+            least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
+        elif net.gap[i] >= 0:
+            if isinstance(contact, LawContact) and u_peak > net.curves[i, 1]:
+                raise InputError(contact.ends(u_peak))
+            least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
+            largest = max(unloaded, least)
+        if u_peak > BREAKDOWN_VOLTAGE:
+            limit = f"air breaks down above about {BREAKDOWN_VOLTAGE:g} V (Paschen minimum 327 V)"
+            yield f"the gap voltage{where} reaches {u_peak:.4g} V; {limit}, which the model does not contain"
+        if least < LEAST_AREA * unloaded:
+            little = f"below {100.0 * LEAST_AREA:g} % of the {1e6 * unloaded:.3g} mm^2 at 0 V"
+            said = f"the contact area{where} falls to {1e6 * least:.3g} mm^2, {little}"
+            yield f"{said}: the contact model was not made for so little"
+        yield from beyond_fingers(where, f_peak, float(contact.stress(u_peak)), largest)
+        if success and 0.0 < u_peak <= u_error and not several:
+            known = f"of its {u_peak:.2g} V nothing is known but that they are as good as 0"
+            yield f"the gap takes no more than rounding of the source's voltage: {known}"
+    for e in problem.circuit.by_device("V", "I"):
+        if e.waveform is not None and e.waveform.precision > DOUBLE:
+            rounded = f"numbers rounded to {e.waveform.precision:.2g} of their size, not doubles"
+            rough = f"it is rough by {run.rough:.2g} V, which the stated errors contain"
+            yield f"the source function of {e.name} gives {rounded}: {rough}"
+    if run.margin < NEAR_FOLD and success:
+        distance = f"the distance to it falls to {run.margin:.2g} (1 far, 0 at the fold)"
+        yield f"the fold of the mobile charge law is near: {distance}"
+    for i, layer in enumerate(problem.network.layers):
+        strength = layer.values.get("e_max", math.inf)
+        if math.isfinite(strength) and record.t.size:
+            field = float(np.abs(record.u_layer[:, i]).max()) / layer.values["d"]
+            if field > strength:
+                met = f"the field in {layer.name} reaches {field:.3g} V/m at the outputs"
+                yield f"{met}; its dielectric strength is {strength:.3g} V/m"
+
+
+def _source_warnings(problem: Problem) -> Iterator[str]:
+    """Warnings about sources that miss the run, and about sources beyond the band of the skin's data."""
+    yield from course_warnings(problem.circuit, problem.t_start, problem.t_stop, problem.by_deck)
+    event = shortest_event(problem)
+    plain = any(isinstance(wave, Function) and not wave.breaks for wave in problem.network.waveforms)
+    if plain and event > _EVENT:
+        seen = f"which was looked at every {format_si(event, 's')}: an event shorter than that may have been missed"
+        mend = "give Function(f, breaks=(...)) its edges, or the circuit a .tran of a shorter TSTEP"
+        yield f"the source is a function, {seen}; {mend}"
+    yield from spectrum_warning(problem.circuit, problem.network.waveform, problem.t_stop)

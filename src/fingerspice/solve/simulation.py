@@ -14,26 +14,34 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import Parameters, Sources, area_given, circuit_warnings, overridden
+from fingerspice.circuit.describe import Parameters, Sources, circuit_warnings, overridden
+from fingerspice.physics.contact import inverse_area_range
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.closed_form import lead_to_fold, run_to_fold, solve_linear
 from fingerspice.solve.collocation import solve as solve_exponential
 from fingerspice.solve.derivatives import check_request, sensitivities_of
-from fingerspice.solve.nodal import solve_coupled, solve_foreign
-from fingerspice.solve.planning import asked, make_plan, run_warnings
-from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare
+from fingerspice.solve.nodal import FOREIGN, solve_coupled, solve_foreign
+from fingerspice.solve.periodic import asked
+from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare, shortest_event
 from fingerspice.solve.recordings.run import solve as solve_recording
-from fingerspice.solve.runs import ROUGH, Progress, Run, excess_of, run_failure
-from fingerspice.waveforms.waveform import DOUBLE, require
+from fingerspice.solve.runs import ROUGH, Progress, Run, excess_of, run_failure, run_warnings
+from fingerspice.solve.stepping import FEWEST_PERIODS
+from fingerspice.waveforms.waveform import DOUBLE, refuse, require
 
 RTOL_RANGE = (1e-13, 0.1)
-METHODS, LIBRARIES = ("auto", "exponential", "radau"), ("scipy", "torchdiffeq")
+METHODS = ("auto", "exponential", "radau")
 # Statuses of a run by exponential steps after which another method is tried: for a stack, and for a network.
 BEYOND_STACKS = (Status.FOLD, Status.TOO_MANY_STEPS, Status.STEP_UNDERFLOW)
 BEYOND_NETWORKS = (*BEYOND_STACKS, Status.ERROR_NOT_MET)
+TIERS = ("algebraic", "linear", "coupled")
+# A scene is called stiff if its fastest rate times the source's shortest time exceeds this: stability alone would then
+# limit the steps of an explicit method.
+STIFF = 300.0
+REPEATS = "periodic: once a period no longer changes the state, later ones repeat it"
 STARTS = ("deck", "uncharged", "dc", "periodic")
 
 
@@ -109,7 +117,7 @@ def simulate(
     SolveError
         Where the run failed and `throw` is set; its `solution` holds the outputs before the failure.
     """
-    rtol = check_arguments(rtol, method, area, start, jumps)
+    rtol = check_arguments(rtol, method, start, jumps)
     # Of their own: results keep them, and the caller's array stays writable.
     times = None if t_eval is None else real_numbers("t_eval", t_eval, "numbers in s").copy()
     circuit = overridden(circuit, sources, parameters)
@@ -142,21 +150,15 @@ def rtol_given(rtol: object, least: float = RTOL_RANGE[0]) -> float:
     return number
 
 
-def check_arguments(
-    rtol: float,
-    method: str = "auto",
-    area: str | float = "coupled",
-    start: str | Solution = "deck",
-    jumps: str = "both",
-) -> float:
-    """`rtol` as a number; arguments of `simulate` that no circuit can run with are refused."""
+def check_arguments(rtol: float, method: str = "auto", start: str | Solution = "deck", jumps: str = "both") -> float:
+    """`rtol` as a number; arguments of `simulate` that no circuit can run with are refused, but for the area."""
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
     library, _, name = method.partition(":")
-    if method not in METHODS and not (library in LIBRARIES and name):
-        known = [*METHODS, *(f"{library}:NAME" for library in LIBRARIES)]
+    known = [f"{library}:{one}" for one in FOREIGN.get(library, ()) if name]
+    if method not in (*METHODS, *known):
+        known = known or [*METHODS, *(f"{library}:NAME" for library in FOREIGN)]
         raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
-    area_given(area)
     if not (isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)):
         raise InputError(f"start is {start!r}; allowed: {', '.join(map(repr, STARTS))} or a Solution")
     return rtol_given(rtol)
@@ -181,13 +183,111 @@ def plan(
     InputError
         For a request that cannot be run.
     """
-    rtol = check_arguments(rtol, area=area)
+    rtol = rtol_given(rtol)
     circuit = overridden(circuit, sources, parameters)
-    t_stop = real_number("t_stop", t_stop, "a number in s") if t_stop is not None else None if circuit.tran else 1.0
-    for text in circuit_warnings(circuit, t_stop):
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    t_stop = 1.0 if t_stop is None and circuit.tran is None else t_stop
     problem = prepare(circuit, t_stop=t_stop, charge_law=charge_law, area=area, charge=charge, rtol=rtol)
+    for text in circuit_warnings(circuit, problem.t_stop):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return make_plan(problem, rtol, tier)
+
+
+def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "auto") -> Plan:
+    """The model for a problem with this error and tier asked for; a method that is named steps the coupled one."""
+    refuse(tier not in ("auto", *TIERS), f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
+    asked = "coupled" if tier == "auto" and method != "auto" else tier
+    key = ("plan", rtol, asked, problem.start, problem.charge, problem.stored, problem.t_start, problem.t_stop)
+    return problem.scene.remember(key, lambda: _plan(problem, rtol, asked))
+
+
+def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
+    scene, model, span = problem.scene, problem.scene.model, problem.t_stop - problem.t_start
+    area, changed = float(scene.net.area0[0]) if scene.fixed else math.nan, math.nan if scene.coupled else 0.0
+    if model is not None and model.coupled:
+        changed, area = _change(model.curve, scene.u_peak)
+    elif scene.coupled and len(problem.network.sources) == problem.network.n_voltage:
+        changed = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
+    best, reason = _best(problem, rtol, changed)
+    chosen = best if tier == "auto" else tier
+    if chosen != best:
+        _refuse(problem, chosen, best)
+        reason = f"asked for; the lightest that is right would be {best}: {reason}"
+    rates, shortest = scene.rates, min(problem.network.waveform.shortest_time(), span)
+    fastest = float(rates.max(initial=0.0))
+    reasons, stiff, needed = [reason], fastest * shortest > STIFF, 0.0
+    if stiff:
+        reasons.append(f"stiff: the fastest rate {fastest:.3g} 1/s against {1.0 / shortest:.3g} 1/s of the source")
+    if chosen == "coupled" and scene.coupled and problem.network.waveform.period:
+        reasons += [REPEATS] if span / problem.network.waveform.period >= FEWEST_PERIODS else []
+    if chosen == "linear" and model is not None and scene.coupled and np.any(model.rate0 > 0.0):
+        needed = changed
+    if scene.skin is not None:
+        f, error = scene.skin
+        reasons.append(f"skin at {f:g} Hz: its dispersion moves the gap voltage by {error:.1g}")
+        needed += error
+    elif scene.network.stack is not None and problem.circuit.by_device("SKIN_DISPERSIVE"):
+        reasons.append(f"skin dispersive: no one frequency serves to rtol = {rtol:g}")
+    if problem.network.waveform.is_sampled:
+        event = format_si(shortest_event(problem), "s")
+        reasons.append(f"a source is a function: an event in it shorter than {event} may be missed without breaks=")
+    found = tuple(sorted(map(float, rates)))
+    return Plan(chosen, tuple(reasons), problem.start, found, stiff, changed, needed, area)
+
+
+def _refuse(problem: Problem, tier: str, best: str) -> None:
+    """Refuse a tier that cannot describe the circuit."""
+    stack, mobile = problem.network.stack, problem.scene.charge_law == "mobile"
+    if stack is None and tier != "coupled":
+        others = "auto" if best == "coupled" else f"auto, {best}"
+        raise InputError(f"the {tier} tier is not for this network; allowed: {others} or coupled")
+    if stack is not None and tier == "algebraic":
+        leaking = stack.layers_of(stack.g_total + stack.g_area > 0.0)
+        what = f"a stack without leaks; here {', '.join(leaking)} leak"
+        raise InputError(f"the algebraic tier needs {what if leaking else 'a start without stored charge'}")
+    if tier == "linear" and problem.scene.coupled and (mobile or problem.charge):
+        what = "the mobile law" if mobile else "the charge (charge=False leaves it out)"
+        raise InputError(f"the linear tier takes the area as fixed, and {what} needs the one that follows the voltage")
+
+
+def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
+    """The lightest tier that is valid, and the reason.
+
+    With capacitors outside the layers, a small change of an area may have a large effect on the voltages over many
+    periods. No useful bound of that effect is known beforehand: a network is coupled however little its areas change.
+    """
+    scene, model, several = problem.scene, problem.scene.model, len(problem.network.fingers) > 1
+    stores = scene.coupled and model is not None and model.mobile and problem.stored > 0.0
+    if model is not None and not (model.rate.any() or model.rate0.any() or stores):
+        return "algebraic", "no layer leaks, so the voltages follow the source at once"
+    if not scene.coupled:
+        which = f"the area{' is' if model is not None else 's are'} {scene.area_mode}"
+        return "linear", f"{which if scene.fixed else 'no element has an area'}, so the circuit is linear"
+    if model is None:
+        follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
+        if math.isnan(changed):
+            return "coupled", f"{follows}; by how much is not known beforehand: a current source sets no bound"
+        return "coupled", f"{follows}, {'each ' if several else ''}by up to {_percent(changed)} of its middle"
+    free = not model.rate0.any()
+    if model.mobile or not (free or changed <= 0.2 * rtol):
+        return "coupled", f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
+    if problem.charge:
+        return "coupled", "only the charge needs the area at every instant; charge=False leaves it out"
+    if free:
+        return "linear", "every leak scales with the area, so under the local law no voltage feels it"
+    return "linear", f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
+
+
+def _percent(share: float) -> str:
+    """A share in percent to two digits, without an exponent where it has three."""
+    return f"{float(f'{100.0 * share:.2g}'):g} %"
+
+
+def _change(curve: FloatArray, u_peak: float) -> tuple[float, float]:
+    """Largest relative change of 1/A under sources with peak `u_peak` (V) from its middle value, and its area (m^2)."""
+    # The gap may hold the whole source voltage, and up to twice that if stored charge adds to a reversed source.
+    least, largest = inverse_area_range(2.0 * u_peak, 65, curve)
+    middle = 0.5 * (least + largest)
+    return max(middle / least, largest / middle) - 1.0, 1.0 / middle
 
 
 def run_problem(
@@ -207,8 +307,7 @@ def run_problem(
     run, name = integrated(problem, plan, rtol, method, progress)
     run.stats["wall_s"] = time.perf_counter() - begin  # type: ignore[assignment]
     # Report the times asked for, not the breakpoints to which `at_breakpoints` has moved some of them.
-    t = t_out if run.t.size == t_out.size else np.concatenate([t_out[: run.t.size], run.t[t_out.size :]])
-    t = t if run.status is Status.SUCCESS else run.t
+    t = t_out[: run.t.size] if run.status is Status.SUCCESS else run.t
     return solution_of(problem, plan, run, run.record(problem), t, rtol, name)
 
 
@@ -294,10 +393,9 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
         run.detail = run.detail or ROUGH.format(run.rough)
     rounding = problem.rounding
     for gap in run.gaps:
-        if gap[0] <= rounding:
+        if 0.0 < gap[0] <= rounding:
             # To round-off the gap is at 0 V: state at least that round-off as its error, and its square for the force.
-            share = rounding / gap[0] if gap[0] > 0.0 else 0.0
-            gap[2:] = np.maximum(gap[2:], (share * gap[0], share**2 * gap[1]))
+            gap[2:] = np.maximum(gap[2:], (rounding, (rounding / gap[0]) ** 2 * gap[1]))
     # A closed form is not refused for its round-off, however small `rtol` is: no other method has a smaller error.
     judged = plan.tier == "coupled" or plan.error_bound > 0.0 or run.rough > 0.0
     if run.status is Status.SUCCESS and judged and excess_of(run.gaps, rounding) > rtol:

@@ -16,6 +16,7 @@ reduced linearly to 0, because a jump of the sources is the limit of a ramp.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -27,12 +28,12 @@ from fingerspice.base.arrays import FloatArray, read_only
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
-from fingerspice.circuit.statespace import Stack
+from fingerspice.circuit.statespace import spanning_tree
 from fingerspice.engine.implicit import N_COUNTERS, Nodal, new_work, pass_jump
 from fingerspice.engine.network import Net, new_room, ramp
 from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
 from fingerspice.numerics.lobatto import radau_scheme
-from fingerspice.physics.contact import inverse_area
+from fingerspice.physics.contact import inverse_area, inverse_areas
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.scenes import Scene
@@ -107,12 +108,10 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
         # An area is NaN if it follows its voltage without delay, or if it starts in equilibrium with it.
         u, area = np.zeros(len(network.cells)), np.full(len(network.areas), np.nan)
         if asked and (circuit.initial or any(cell.element.initial is not None for cell in network.cells)):
-            total: dict[str, float] = {}
-            for cell in network.cells:
-                total[cell.element.name] = total.get(cell.element.name, 0.0) + 1.0 / cell.c
             # The slabs of a dispersive layer share its voltage in proportion to their elastances, as in a jump.
-            started = [(c, start_voltage(c.element, circuit.initial)) for c in network.cells]
-            u = np.array([voltage / (c.c * total[c.element.name]) for c, voltage in started])
+            _, layer = np.unique([cell.element.name for cell in network.cells], return_inverse=True)
+            share = (1.0 / scene.net.c) / np.bincount(layer, 1.0 / scene.net.c)[layer]
+            u = share * [start_voltage(cell.element, circuit.initial) for cell in network.cells]
             for i, one in enumerate(network.areas):
                 if scene.net.slow[i] >= 0:
                     area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
@@ -124,28 +123,25 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Cell voltages (V), areas (m^2) and sources at the DC operating point (at 0-), the nodes in `initial` held."""
     net, stack = scene.net, scene.network.stack
-    s = np.array([float(w.value(0.0, "left")) for w in scene.network.waveforms])
-    if stack is not None and scene.model is not None and not initial:
-        order = list(stack.state_order)
-        return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.net.area0, s
-    conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in scene.network.areas}
-    added = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
-    # The reduced network of a series loop has no nodes, so the operating point needs the unreduced network.
-    rebuilt = stack is not None or added
-    network = build_network(replace(circuit, work="gap"), added) if rebuilt else scene.network
-    sources = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
+    s = sources = np.array([float(w.value(0.0, "left")) for w in scene.network.waveforms])
+    network, added = scene.network, held_sources(circuit, initial) if initial else ()
+    if added:
+        # The reduced network of a series loop has no nodes to be held.
+        network = build_network(replace(circuit, work="gap"), added)
+        sources = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
     area, follows = scene.net.area0.copy(), net.gap >= 0
     held = np.array([a.node in initial for a in network.areas], bool) & follows
     area[held] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, held, strict=True) if mark]
     _refuse_floating_at_dc(network, area)
+    if not (initial or s.any()):
+        return np.zeros(len(network.cells)), area, s
     part, before = 1.0, math.inf
     for _ in range(500):
         k, b = network.stiffness(network.leak(area))
-        x = np.linalg.solve(k, -b @ sources) if k.size else np.zeros(0)
+        x = np.linalg.solve(k, -b @ sources)
         u, new = network.p @ x + network.q @ sources, area.copy()
-        for i, (contact, gap) in enumerate(zip(scene.network.contacts, network.gaps, strict=True)):
-            if contact is not None and gap is not None and follows[i] and not held[i]:
-                new[i] = float(contact.area(abs(float(u[gap]))))
+        for i in np.flatnonzero(follows & ~held).tolist():
+            new[i] = 1.0 / inverse_area(abs(float(u[network.gaps[i]])), net.curves[i])[0]
         off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
         # The iteration has converged, or round-off lets it come no nearer.
         if off <= 4e-16 or 0.8 * before < off <= 1e-13:
@@ -155,7 +151,7 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
         area, before = area + part * (new - area), off
     else:
         raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
-    if stack is not None:
+    if stack is not None and added:
         of: dict[str, list[float]] = {}
         for layer, count in zip(stack.layers, stack.cells, strict=True):
             each = [v for cell, v in zip(network.cells, u.tolist(), strict=True) if cell.element is layer]
@@ -179,7 +175,7 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
     slow, x, charge = (area / net.area0)[net.slow >= 0], u[list(network.live)], np.zeros(len(network.sources))
     rest, q = u - network.p @ x, network.q
     before = np.zeros(q.shape[1]) if s is None else s
-    if s is None and q.size and np.any(rest):
+    if s is None and np.any(rest):
         # The values that agree with the cell voltages in the least-squares sense.
         before = np.asarray(np.linalg.lstsq(q, rest, rcond=None)[0], float)
     after = np.array([float(w.value(0.0)) for w in scene.network.waveforms])
@@ -205,30 +201,6 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
     return state
 
 
-def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
-    """Cell voltages (V) along the loop (n_cell,) at the DC operating point; refused where some node has none."""
-    insulating = stack.layers_of(stack.g_total + stack.g_area == 0.0)
-    if len(insulating) > 1:
-        raise InputError(
-            f"no DC operating point: {' and '.join(insulating)} do not leak, so the nodes between them are reached "
-            "by capacitors only; allowed: a leakage (r=...), or uic in .tran to start uncharged"
-        )
-
-    def split(area: float) -> FloatArray:
-        g = stack.g_total + stack.g_area * area
-        # A layer that does not leak takes all of the voltage.
-        r = (g == 0.0) + 0.0 if insulating else 1.0 / g
-        return np.asarray(u_source * r / r.sum())
-
-    if stack.gap is None or not model.coupled:
-        return split(model.area0)
-    low, high = 0.0, abs(u_source)
-    while low < (middle := 0.5 * (low + high)) < high:
-        more = abs(split(1.0 / inverse_area(middle, model.curve)[0])[stack.gap]) > middle
-        low, high = (middle, high) if more else (low, middle)
-    return split(1.0 / inverse_area(high, model.curve)[0])
-
-
 # Residual of Kirchhoff's law that rounded decimals of a deck may cause, relative to the largest start voltage; and
 # tolerance of a step towards consistent start voltages, relative to that voltage, and its stages.
 ROUNDING, STEP_ERROR, STAGES = 1e-12, 1e-14, 7
@@ -249,30 +221,28 @@ def start_voltage(element: Element, initial: Mapping[str, float]) -> float:
 
 def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Element, ...]:
     """Voltage sources that hold the nodes of ``.ic`` (V) while the operating point is found."""
-    # Groups of nodes tied together by sources, with the voltage of each node above one of its group.
-    tied: dict[str, dict[str, float]] = {}
-    for element in circuit.by_device("V"):
-        p, n = (tied.setdefault(node, {node: 0.0}) for node in element.nodes)
-        assert element.waveform is not None
-        shift = n[element.nodes[1]] + float(element.waveform.value(0.0, "left")) - p[element.nodes[0]]
-        n.update({node: above + shift for node, above in p.items()})
-        tied.update(dict.fromkeys(p, n))
-    out, done = list[Element](), {"0"}
-    for node in initial:
-        group = tied.get(node, {node: 0.0})
-        if node not in done and "0" not in group:
-            value = float(np.mean([initial[x] - group[x] for x in group if x in initial])) + group[node]
-            # This name contains characters that no netlist can contain, so that it cannot clash with an element's.
-            out.append(Element(f"v({node}) held", "V", (node, "0"), (node, "0"), MappingProxyType({}), DC(value)))
-        done |= group.keys()
+    conductors = {n for e in circuit.elements for n in e.nodes[:2]} - {n for e in circuit.elements for n in e.nodes[2:]}
+    initial = {node: v for node, v in initial.items() if node in conductors}
+    sources = circuit.by_device("V")
+    taken, of_tree = spanning_tree([*(e.nodes for e in sources), *((node, "0") for node in initial)])
+    known = [float(e.waveform.value(0.0, "left")) for e in sources if e.waveform is not None]
+    own = np.append(known, np.zeros(len(initial)))[taken]
+    out = []
+    for place, node in enumerate(itertools.compress(initial, taken[len(sources) :]), len(sources)):
+        # The nodes that sources tie to this one, which share its row of the tree
+        value = np.mean([v - of_tree[x] @ own for x, v in initial.items() if of_tree[x][place] != 0.0])
+        # This name contains characters that no netlist can contain, so that it cannot clash with an element's.
+        ends = (node, "0")
+        out.append(Element(f"v({node}) held", "V", ends, ends, MappingProxyType({}), DC(float(value))))
     return tuple(out)
 
 
 def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
     """Refuse a network in which some voltage is determined by capacitors only, so that it has no DC value."""
-    factor = np.vstack([network.resistor_factor, np.sqrt(network.leak(area))[:, None] * network.p])
-    if not factor.shape[1]:
+    leak = network.leak(area)
+    if np.all(leak > 0.0) or not network.live:
         return
+    factor = np.vstack([network.resistor_factor, np.sqrt(leak)[:, None] * network.p])
     # Scale the columns before the rank is determined, because conductances range over many decades.
     size = np.linalg.norm(factor, axis=0)
     _, sigma, turned = np.linalg.svd(factor / np.where(size > 0.0, size, 1.0))
@@ -282,25 +252,22 @@ def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
         names = dict.fromkeys(c.element.name for c, mark in zip(network.cells, held, strict=True) if mark)
         raise InputError(
             f"no DC operating point: {' and '.join(names)} leave nodes that are reached by capacitors only; allowed: a "
-            "leakage (r=... or an R), or uic in .tran to start uncharged"
+            "leakage (r=...) or an R, or uic in .tran to start uncharged"
         )
 
 
 def at_own_area(u: float, area: float, curve: FloatArray) -> float:
     """The gap voltage (V) on its own area that has the same charge as `u` (V) on `area` (m^2), under ``mobile``."""
-
-    def charge(v: float) -> float:
-        return v / inverse_area(v, curve)[0]
-
-    wanted, low, high = area * abs(u), 0.0, 1e-3 * abs(u)
-    # The charge grows with the voltage up to the fold, so the first interval found contains the root on the branch
-    # that starts at 0 V.
-    while charge(high) < wanted:
-        low, high = high, 1.05 * high
-        if high > 100.0 * abs(u):
-            raise InputError(f"the start has {u:.4g} V across a gap of {area * 1e6:.4g} mm^2, {PAST_FOLD}")
+    # The charge grows with the voltage up to the fold, so the first interval in which it reaches the one wanted
+    # contains the root on the branch that starts at 0 V.
+    wanted, at = area * abs(u), abs(u) * np.geomspace(1e-3, 100.0, 237)
+    reached = np.flatnonzero(at / inverse_areas(at, curve) >= wanted)
+    if not reached.size:
+        raise InputError(f"the start has {u:.4g} V across a gap of {area * 1e6:.4g} mm^2, {PAST_FOLD}")
+    low, high = np.append(0.0, at)[reached[0] : reached[0] + 2].tolist()
     while low < (middle := 0.5 * (low + high)) < high:
-        low, high = (middle, high) if charge(middle) < wanted else (low, middle)
+        enough = middle / inverse_area(middle, curve)[0] >= wanted
+        low, high = (low, middle) if enough else (middle, high)
     return math.copysign(high, u)
 
 

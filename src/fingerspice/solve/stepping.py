@@ -14,11 +14,12 @@ from fingerspice.engine.collocation.loop import Circuit, Looks
 from fingerspice.engine.collocation.readout import LoopState, Outputs
 from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Sources
+from fingerspice.engine.one_area.system import area_missed
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.steps import Recorder
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Integration, Run, excess_of
+from fingerspice.solve.runs import Integration, Run, excess_of, with_error
 from fingerspice.waveforms.sampling import same_time
 
 FEWEST_PERIODS = 6.0  # Runs of fewer periods are integrated throughout, because nothing would be saved
@@ -52,7 +53,8 @@ class Stepping(Integration):
     n_error: int  # Size of `LoopState.error`
     gaps: list[int]  # Rows of `peaks` of the gaps whose errors are stated
     largest: float  # Voltage (V) beside the peaks that the round-off of the charge goes with
-    area_error: float  # Relative error of the areas' polynomials
+    decade: int  # Of the relative error asked for, which chooses the areas' polynomials
+    curves: FloatArray  # (n_area, l): Of the areas, as in `Net`
     capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
     charge_safety = 1.0  # Stated error of the charge over the estimate
     rates: FloatArray  # Decay rates of the modes, among them those at 0 V, 1/s
@@ -96,7 +98,7 @@ class Stepping(Integration):
         """Go to the start, with an initial state and an error of a step (V)."""
         self.controls, self.step = np.zeros(1, readout.CONTROL), np.zeros(1, readout.STEP)
         self.control = self.controls[0]
-        self.control["t"], self.control["margin"] = self.problem.t_start, 1.0
+        self.control["t"], self.control["margin"], self.control["magnified"] = self.problem.t_start, 1.0, 1.0
         self.branch = np.full((self.net.gap.size, 2), [self.problem.t_start, math.inf])  # As in `LoopState`
         self.counters, self.error = np.zeros(readout.N_COUNTERS, np.int64), np.zeros(self.n_error)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
@@ -167,9 +169,11 @@ class Stepping(Integration):
         moved = max(float(self.control["peak_q"]), *map(abs, self.y[-self.s_before.size :].tolist()))
         # Every step adds the round-off of the charge that is held, and the relative error of the areas' polynomials is
         # also a relative error of all charge moved.
-        run.charge_error = float(
-            self.charge_safety * estimate + 4e-16 * held * steps + self.area_error * (held + moved)
+        missed = self.problem.scene.remember(
+            ("missed", self.decade, self.curves.tobytes()),
+            lambda: max((area_missed(curve, self.decade) for curve in self.curves), default=0.0),
         )
+        run.charge_error = float(self.charge_safety * estimate + 4e-16 * held * steps + missed * (held + moved))
 
     def through(self, sources: Sources, t_end: float) -> Status:
         # A period that has been repeated may have led there already.
@@ -240,8 +244,5 @@ class Stepping(Integration):
         self.control["t"] = stop if abs(stop - reached) <= same_time(stop) else reached
         self.branch[:, 0] += periods * period
         # What the voltages, and the charge over the capacitance, are still off the periodic state: `off` and `owed`, V.
-        for peak in self.peaks:
-            peak[readout.ERROR_U] += off
-            if peak[readout.PEAK_U] > 0.0:
-                peak[readout.ERROR_F] += off * 2.0 * peak[readout.PEAK_F] / peak[readout.PEAK_U]
+        self.peaks[:] = with_error(self.peaks, off)
         self.repeated += periods

@@ -21,11 +21,11 @@ from fingerspice.circuit.network import Network
 from fingerspice.results.outcome import Plan, SolveError, State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
-from fingerspice.solve.planning import asked, make_plan
+from fingerspice.solve.periodic import asked
 from fingerspice.solve.problem import Problem, at_breakpoints, check_length, check_outputs
 from fingerspice.solve.recordings.run import LaneMarch, LostError, prepared
 from fingerspice.solve.runs import Run
-from fingerspice.solve.simulation import check_arguments, integrated, own_rtol, solution_of, state_error
+from fingerspice.solve.simulation import check_arguments, integrated, make_plan, own_rtol, solution_of, state_error
 from fingerspice.solve.starting import as_shown
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import on_breakpoint
@@ -62,7 +62,7 @@ class Outputs:
         return np.asarray(np.minimum(t, self.stop))
 
 
-class Stream:
+class Stream(Iterator[Solution]):
     """A run chunk by chunk: an iterator over `Solution` objects, made by `fs.stream`.
 
     Attributes
@@ -90,9 +90,6 @@ class Stream:
         # and the run of the last window.
         self._asked, self._method = (method, method) if found is None else ("exponential", "relaxation")
         self._last = Run(*_NO_OUTPUTS, Status.SUCCESS, 0, {}, problem.initial)
-
-    def __iter__(self) -> Iterator[Solution]:
-        return self
 
     def __len__(self) -> int:
         """Total number of chunks."""
@@ -148,17 +145,17 @@ class Stream:
             count -= t.size
         if len(found) == 1:
             return found[0]
-        # The numbers of a column stay together in memory, as they are read.
-        return np.concatenate([t for t, _ in found]), np.concatenate([rows.T for _, rows in found], axis=1).T
+        # The numbers of a column stay together in memory, as they are read. Windows have unwanted charges, too.
+        width = min(rows.shape[1] for _, rows in found)
+        return np.concatenate([t for t, _ in found]), np.concatenate([rows.T[:width] for _, rows in found], axis=1).T
 
     def _piece(self, march: LaneMarch) -> tuple[FloatArray, FloatArray]:
         """Times (s) and rows of the next piece of a recording."""
         piece, o = march.pieces[march.place], self.outputs
         # All outputs up to the end of the piece, and a few more.
         end = math.ceil((piece.stop - o.start) / o.spacing) - o.low + 2
-        t = run_at = o.times(self._written, max(end, self._written))
-        if o.rate is None:
-            run_at = at_breakpoints(replace(self.problem, t_start=piece.start, t_stop=piece.stop), t)
+        t = o.times(self._written, max(end, self._written))
+        run_at = at_breakpoints(replace(self.problem, t_start=piece.start, t_stop=piece.stop), t)
         out = march.outputs_at(run_at)
         try:
             march.follow(run_at, out)
@@ -168,7 +165,7 @@ class Stream:
             return self._window()
         count = march.outputs
         self._written += count
-        return t[:count], march.form.recorded(self.problem, out[:, :count])
+        return t[:count], out[:, :count].T
 
     def _window(self) -> tuple[FloatArray, FloatArray]:
         """Times (s) and rows of the next window."""
@@ -265,18 +262,15 @@ def stream(
     SolveError
         While iterating, where the run fails; its `solution` holds the outputs after the last chunk.
     """
-    rtol = check_arguments(rtol, method, area, start)
-    chunk = None if chunk is None else positive_number("chunk", chunk, "s")
+    rtol = check_arguments(rtol, method, start)
+    require(chunk is None or count is None, "count", "given beside chunk", "one of them")
+    length = positive_number("chunk", CHUNK if chunk is None else chunk, "s")
     step = None if step is None else positive_number("step", step, "s")
-    if count is not None:
-        count = whole_number("count", count, 1)
-        require(chunk is None, "count", "given beside chunk", "one of them")
+    count = None if count is None else whole_number("count", count, 1)
     circuit = overridden(circuit, sources, parameters)
     problem = asked(circuit, t_stop=t_stop, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol)
     check_length(problem.network.waveform, problem.t_start, problem.t_stop)
     outputs = Outputs(problem, step)
-    if count is None:
-        count = max(1, round((CHUNK if chunk is None else chunk) / outputs.spacing))
-    count = min(count, outputs.total)
+    count = min(count or max(1, round(length / outputs.spacing)), outputs.total)
     check_outputs(circuit, count)
     return Stream(problem, make_plan(problem, rtol, tier, method), outputs, count, rtol, method)

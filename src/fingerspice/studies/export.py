@@ -14,7 +14,7 @@ from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import find_branches
-from fingerspice.netlist.reader import LIBRARIES, library_text
+from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from fingerspice.physics.contact import Contact, JkrContact, LawContact
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
@@ -67,8 +67,7 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
             if other.lower() != name.lower():
                 raise InputError(f"{other} and {name} would be one name in the export; allowed: rename one of them")
     network = network_of(circuit)
-    pairs = zip(network.areas, network.contacts, strict=True)
-    contacts = {area.node: contact for area, contact in pairs if contact is not None}
+    contacts = dict(network.named_contacts)
     areas = _start_areas(circuit, law, contacts)
     ratio = max((one.work_ratio for one in contacts.values() if isinstance(one, JkrContact)), default=1.0)
     lines = [circuit.title or "fingerspice export"]
@@ -85,12 +84,11 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     if (ac := circuit.ac) is not None:
         lines.append(f".ac {ac.scale} {ac.points} {ac.start!r} {ac.stop!r}")
     lines += _start_lines(circuit, areas, contacts)
-    lines += ["", library_text(law).rstrip(), ""]
-    top = prepare(circuit, charge_law=law, charge=False).scene.u_top if any(e.law for e in circuit.elements) else 0.0
-    for gap in circuit.by_device("GAP"):
-        contact = contacts[gap.nodes[2]]
+    lines += ["", shipped_text(law).rstrip(), ""]
+    for name, contact in contacts.items():
         if isinstance(contact, LawContact):
-            lines += _table(_element_name(gap), contact, contact.reach(top))
+            reach = contact.reach(prepare(circuit, charge_law=law, charge=False).scene.u_top)
+            lines += _table(_element_name(circuit[name]), contact, reach)
     lines += [_OPTIONS, ".end", ""]
     return "\n".join(lines)
 
@@ -134,7 +132,7 @@ def _start_areas(circuit: Circuit, law: str, contacts: Mapping[str, Contact]) ->
     for area in find_branches(circuit)[0]:
         value = area.given
         if value is None and area.gap is not None:
-            value = float(contacts[area.node].area(abs(start_voltage(area.gap, circuit.initial))))
+            value = float(contacts[area.gap.name].area(abs(start_voltage(area.gap, circuit.initial))))
         assert value is not None
         out[area.node] = 1e6 * value
     if any(gap.values["tau"] > 0.0 for gap in circuit.by_device("GAP")):
@@ -155,7 +153,7 @@ def _start_lines(circuit: Circuit, areas: Mapping[str, float], contacts: Mapping
         if node != "0" and node not in gaps:
             yield f".ic v({written[node]})={value!r}"
     for node, gap in gaps.items():
-        contact, held = contacts[node], circuit.initial.get(node)
+        contact, held = contacts[gap.name], circuit.initial.get(node)
         guess = gap.values["a_fix"] or 1e6 * float(contact.area(0.0))
         if areas:
             # An area with a delay is a state and needs a start value; for an area without delay a guess is enough.

@@ -15,6 +15,7 @@ from fingerspice.base.errors import FingerspiceWarning
 from fingerspice.base.files import write_csv
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.netlist.netlist import parse_netlist
+from fingerspice.netlist.reader import shipped_text
 from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.plots import drawing
 from fingerspice.results.solution import Solution
@@ -23,17 +24,6 @@ from fingerspice.studies.steady import phasor, steady_state
 from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import Sine, Waveform, require
 
-TABLE1_DECK = """\
-Fingerpad on a 3M-coated touchscreen, Table 1
-Vdrive  drive 0          SIN(0 200 100)
-Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg
-Xgap    top   skin area  GAP   d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3
-+                              alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
-Xskin   skin  0    area  SKIN  d=350u f=100
-.tran 10u 50m uic
-.end
-"""
-"""Table 1 under a sine of 200 V and 100 Hz (Fig. 4, left), as in `circuits/fingerpad.cir`."""
 #: Source amplitudes of Fig. 3, and of Figs. 4 and 5, V; and the frequencies of the latter, Hz.
 U0_FORCE, U0_TIME, FREQUENCIES = 140.0, 200.0, (100.0, 5000.0)
 # Letters of units in a data file.
@@ -41,9 +31,9 @@ _ASCII = str.maketrans({"µ": "u", "²": "^2", "Ω": "ohm"})
 
 
 def table1_circuit(*, dispersive: bool = False) -> Circuit:
-    """The circuit of `TABLE1_DECK`; with `dispersive` its skin has its own data at every frequency."""
-    own = TABLE1_DECK.replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE d=350u")
-    return parse_netlist(own if dispersive else TABLE1_DECK)
+    """Table 1 under a sine of 200 V and 100 Hz (Fig. 4, left); with `dispersive` its skin follows the frequency."""
+    deck = shipped_text("fingerpad.cir")
+    return parse_netlist(deck.replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE d=350u") if dispersive else deck)
 
 
 class Variation(NamedTuple):
@@ -112,9 +102,8 @@ def figure_2() -> Drawn:
         (right, eps, r"Relative permittivity $\varepsilon_\mathrm{r,sc}$", "Eq. 19", drawing.VERMILION, (1e3, 1e4)),
     ):
         ax.loglog(f, y, color=color, linewidth=1.6)
-        drawing.dress(ax, label, "Frequency $f$ [Hz]")
+        drawing.dress(ax, label, "Frequency $f$ [Hz]", xlim=SKIN_BAND, ylim=limits)
         ax.set_title(title, fontsize=drawing.FONT, loc="left")
-        ax.set(xlim=SKIN_BAND, ylim=limits)
     return figure, {"frequency [Hz]": f, "rho_sc [ohm m]": rho, "eps_r_sc [1]": eps}
 
 
@@ -137,13 +126,11 @@ def figure_3(points: int = 46) -> Drawn:
             ax.semilogx(f, force, label=label, color=color, linestyle=dash, linewidth=width)
         other_scale = variation.name == "d_a"
         ax.set_title(variation.title + " (other scale)" * other_scale, fontsize=drawing.FONT, loc="left")
-        ax.set(xlim=(f[0], f[-1]), ylim=(0.0, 0.25 if other_scale else 0.125))
+        y_label = r"Mean force $F_\mathrm{el}$ [N]" if ax in axes[::2] else ""
+        x_label, top = "Frequency $f$ [Hz]" if ax in axes[2:] else "", 0.25 if other_scale else 0.125
+        drawing.dress(ax, y_label, x_label, xlim=(f[0], f[-1]), ylim=(0.0, top))
         # In the corner that the panel's curves leave free.
         ax.legend(loc=4 if variation.name == "r_a" else 2, fontsize=drawing.FONT - 1.0, frameon=False)
-    for ax in axes[::2]:
-        drawing.dress(ax, r"Mean force $F_\mathrm{el}$ [N]")
-    for ax in axes[2:]:
-        drawing.dress(ax, "", "Frequency $f$ [Hz]")
     return figure, columns
 
 
@@ -195,14 +182,11 @@ def _time_figure(shape: type[Sine] | type[Square]) -> Drawn:
         for ax in (upper, lower):
             drawing.legend_above(ax, right=True, math=True)
         upper.set_title(f"{frequency:g} Hz", fontsize=drawing.FONT + 0.5, loc="left", weight="bold")
-        upper.set_xlim(-0.02 * t[-1], 1.02 * t[-1])
-        upper.set_xticks(np.linspace(0.0, t[-1], 5))
-        drawing.dress(lower, "", f"Time [{unit}]")
+        ends, marks = (-0.02 * t[-1], 1.02 * t[-1]), np.linspace(0.0, t[-1], 5)
+        drawing.dress(lower, "", f"Time [{unit}]", xlim=ends, xticks=marks)
         parts.append((np.full(data["t"].size, frequency), *data.values()))
     drawing.dress(axes[0], "Voltage [V]")
-    drawing.dress(axes[2], r"Force $F_\mathrm{el}$ [N]")
-    for ax in axes[2:]:
-        ax.set_ylim(0.0, None)
+    drawing.dress(axes[2], r"Force $F_\mathrm{el}$ [N]", ylim=(0.0, None))
     return figure, {name: np.concatenate(c) for name, c in zip(header, zip(*parts, strict=True), strict=True)}
 
 

@@ -480,17 +480,14 @@ class Task:
         # With a carrier the force is also evaluated midway between samples, as Simpson's rule for its mean needs it.
         self.lead, self.fine = round(finger.lead * rate), 1 if carrier is None else 2
         t = np.arange(self.fine * math.floor(end * rate * (1.0 + 1e-12)) + 1) / (self.fine * rate)
-        contact, force, least, scale, rest = finger.contact, wave.value(t), "0 N", 1.0, 0.0
+        mu, load, least, force = finger.contact.mu, finger.contact.f_n, "0 N", (asked := wave.value(t))
         if kind == "friction":
-            scale, rest = contact.mu, contact.f_n
-            allowed = "mu > 0, or a wanted force"
-            refuse(scale == 0.0, f"the GAP has mu=0, so that no voltage makes friction; allowed: {allowed}")
+            refuse(mu == 0.0, "the GAP has mu=0, so that no voltage makes friction; allowed: mu > 0, or a wanted force")
             # F_el = F_T / mu - F_N (Eq. 1 with full slip).
-            force, least = force / scale - rest, f"{scale * rest:g} N, the friction without a voltage"
+            force, least = asked / mu - load, f"{mu * load:g} N, the friction without a voltage"
         bad = np.flatnonzero(~(force >= -1e-12 * max(1.0, float(np.abs(force).max()))))
         if bad.size:
-            value = scale * (float(force[bad[0]]) + rest)
-            said = f"{kind}: {value:g} N at {t[bad[0]]:g} s is reached by no voltage, which only attracts"
+            said = f"{kind}: {asked[bad[0]]:g} N at {t[bad[0]]:g} s is reached by no voltage, which only attracts"
             raise InputError(f"{said}; allowed: from {least}")
         # Negative round-off becomes 0.
         self.wanted = np.maximum(force, 0.0)

@@ -112,10 +112,8 @@ class Capability(Shown):
         right.plot(self.frequency, factor * self.largest, color=drawing.BLUE, marker="o", markersize=3)
         right.set_ylim(bottom=0.0)
         for ax, label in ((left, f"Mean friction [{unit}]"), (right, f"Largest amplitude, best mean [{unit}]")):
-            ax.set_xscale("log")
-            drawing.dress(ax, label, "Modulation frequency [Hz]")
-        wave = "unipolar drive" if self.carrier is None else f"carrier {format_si(self.carrier, 'Hz')}"
-        drive = f"at most {format_si(self.limit, 'V')}, {wave}"
+            drawing.dress(ax, label, "Modulation frequency [Hz]", xscale="log")
+        drive = f"at most {format_si(self.limit, 'V')} {on_carrier(self.carrier)}"
         drawing.caption(figure, f"{heading(self.circuit)} · {drive} · mean friction {self._range()}")
         return figure
 
@@ -282,8 +280,8 @@ class FoldLimits(Shown):
             ax.plot(x, sweep.voltages, color=drawing.BLUE, marker="o", markersize=3, label="fold of the mobile law")
             ax.fill_between(x, sweep.voltages, 1e6, color=drawing.GREY, alpha=0.2, linewidth=0, label="no solution")
             ax.plot([own], [self.peak], color=drawing.VERMILION, marker="D", linestyle="none", label="this deck")
-            ax.set(xscale="log", yscale="log")
-            drawing.dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
+            label = "Peak source voltage [V]" if ax is axes[0] else ""
+            drawing.dress(ax, label, f"{sweep.name.capitalize()} [{unit}]", xscale="log", yscale="log")
         shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in self.sweeps] + [[self.peak]])
         axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
         known = axes[0].get_legend_handles_labels()

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,9 +33,6 @@ from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.runs import Progress
 from fingerspice.solve.simulation import rtol_given, run_problem
 from fingerspice.waveforms.waveform import Fundamental, Sine, refuse, require
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 # Largest number of frequencies; outputs in a period, through which cubics interpolate a sine to 1e-9 of its amplitude.
 MAX_FREQUENCIES, POINTS = 1_000_000, 400
@@ -79,8 +76,7 @@ def sweep_frequencies(sweep: AcSweep) -> FloatArray:
     """Frequencies (Hz) of an ``.ac`` line, of which at most `MAX_FREQUENCIES` are allowed."""
     base, ratio = (10.0 if sweep.scale == "dec" else 2.0), sweep.stop / sweep.start
     count = sweep.points - 1.0 if sweep.scale == "lin" else math.log(ratio) / math.log(base) * sweep.points
-    if not count < MAX_FREQUENCIES:
-        raise InputError(f"the sweep has {count + 1.0:.3g} frequencies; allowed: at most {MAX_FREQUENCIES}")
+    refuse(count >= MAX_FREQUENCIES, f"the sweep has {count + 1.0:.3g} frequencies; allowed: at most {MAX_FREQUENCIES}")
     if sweep.scale == "lin":
         return np.linspace(sweep.start, sweep.stop, sweep.points)
     n = math.floor(count + 1e-9)
@@ -150,9 +146,9 @@ def phasor(
         areas = np.array([phasor_areas(network, area, float(x), amplitude) for x in f])
         if scene is None:
             # Node voltages at the areas that the circuit gives; as in ngspice, the AC of every source counts.
-            own = [amplitude * np.exp(1j * phase)]
-            s = own if alone else [0.0 if e.ac is None else e.ac.phasor for e in network.sources]
-            v = np.array([network.node_phasors(float(x), areas[0], np.array(s, complex)) for x in f])
+            own = amplitude * np.exp(1j * phase)
+            s = np.array([own if alone else e.ac.phasor if e.ac is not None else 0.0 for e in network.sources], complex)
+            v = np.array([network.node_phasors(float(x), areas[0], s) for x in f])
             layers, gain, u_gap, size, force = np.zeros((f.size, 0), complex), none + 0j, none + 0j, none, none
             results: tuple[NDArray[np.inexact], ...] = (v,)
         else:
@@ -162,13 +158,12 @@ def phasor(
             stress = scene.contact.stress(np.abs(u_gap))
             force = 0.5 * stress * size  # At a constant area the mean over a period of a sine is half the peak
             results = (layers, size, u_gap, force)[: 4 if math.isfinite(amplitude) else 2]
+            warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
         impedance = np.array([network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)]) if alone else None
     finite = np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
     if not finite.all():
         nearer = "frequencies nearer to the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
         raise InputError(f"the phasor at {f[np.argmin(finite)]:g} Hz is beyond the range of numbers; allowed: {nearer}")
-    if scene is not None:
-        warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     names = () if scene is None else tuple(e.name for e in network.layers)
@@ -221,7 +216,7 @@ class SteadyState(Shown, Figured):
             period = (error.message,)
         return Page([found, changes, "", *period])
 
-    def plot(self, signals: str | Sequence[str] | None = None) -> Figure:
+    def plot(self, signals: str | Sequence[str] | None = None) -> drawing.Figure:
         """The period's signals against time; `signals` as in `Solution.plot`."""
         return self.solution.plot(signals)
 
@@ -459,7 +454,7 @@ class Comparison(Shown):
     solution: Solution
 
     def _page(self) -> Page:
-        rows = [(f"{label} [{unit}]", *(f"{x:.6g}" for x in numbers)) for label, unit, numbers in self._labelled(2)]
+        rows = list(self._lines(2, ".6g", ".6g"))
         head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
         state = f"periodic state at {format_si(self.frequency, 'Hz')}, charge law {self.solution.charge_law}"
         page: list[str | Table] = [*head_lines(self.solution.circuit), state, "", Table(head, rows), ""]
@@ -496,9 +491,8 @@ class Comparison(Shown):
         figure.align_ylabels(axes[:2])
         split = "transient,\nmean area", "transient,\ncoupled", "coupled −\nphasor", "of it, ripple\nof the area"
         cells = [["", "phasor", *split]]
-        for label, unit, numbers in self._labelled(3):
-            texts = [f"{x:{'.5g' if place < 3 else '+.2g'}}".replace("-", "−") for place, x in enumerate(numbers)]
-            cells.append([f"{label} [{unit.replace('deg', '°').replace('^2', '²')}]", *texts])
+        for label, *texts in self._lines(3, ".5g", "+.2g"):
+            cells.append([label.replace("[deg]", "[°]").replace("^2", "²"), *(x.replace("-", "−") for x in texts)])
         axes[2].axis("off")
         # Names of GAPs need more room.
         first, size = (0.36, drawing.FONT - 0.5) if len(self.gaps) == 1 else (0.42, drawing.SMALL)
@@ -525,11 +519,12 @@ class Comparison(Shown):
                 out.append((name if len(self.gaps) == 1 else f"{name}:{gap}", unit, p, m, c, c - p, c - m))
         return out
 
-    def _labelled(self, place: int) -> Iterator[tuple[str, str, list[float]]]:
-        """Rows with the names at this place of `_FIGURES`."""
+    def _lines(self, place: int, form: str, change: str) -> Iterator[tuple[str, ...]]:
+        """Rows as text: the names at this place of `_FIGURES`, the figures, and the changes of them, in these forms."""
         for what, unit, *numbers in self.rows():
             name, _, gap = what.partition(":")
-            yield f"{_FIGURES[name][place]} {gap}".rstrip(), unit, numbers
+            texts = map(format, numbers, [form] * 3 + [change] * 2)
+            yield f"{_FIGURES[name][place]} {gap}".rstrip() + f" [{unit}]", *texts
 
     @property
     def gaps(self) -> tuple[str, ...]:
@@ -570,14 +565,13 @@ def compare(
         If a transient fails.
     """
     circuit = overridden(circuit, sources, parameters)
-    names = [e.name for e in circuit.by_device("GAP")]
+    names = [name for name, _ in network_of(circuit).named_contacts]
     fundamental = linear_scene(circuit, next(iter(names), None)).network.waveforms[0].fundamental
     if fundamental is None:
         raise InputError("compare needs a source with a fundamental: a periodic one; this source has none")
-    phasors = {name: phasor(circuit, finger=name) for name in names}
+    found = [phasor(circuit, finger=name) for name in names]
     how: dict[str, Any] = {"charge_law": charge_law, "rtol": rtol, "points": 2000}
     coupled, mean = (steady_state(circuit, area=area, **how).solution for area in ("coupled", "mean"))
-    found = [phasors[name] for name in coupled.gaps]
     figures = [(abs(p.u_gap[0]), np.degrees(np.angle(p.gain[0])), p.f_el_mean[0], p.area[0]) for p in found]
     ways: list[Any] = [np.array(figures).T]
     for one in (mean, coupled):

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -307,29 +307,25 @@ class Block:
 class Piece:
     """A part of a run with evenly spaced samples, or with the points of a PWL."""
 
-    # start, spacing: Time of the first sample and distance of the samples, s
+    # start, spacing: Time of the first sample and (mean) distance of the samples, s
     start: float
     spacing: float
-    # first, last: Numbers of the first and the last sample; both 0 for one step between two times that are no samples
+    # first, last: Numbers of the first and the last sample
     first: int = 0
     last: int = 0
-    # Whether its steps grow from its start on: where a run of a network starts, the source may jump, after which fast
-    # modes decay that no step of a sample resolves
-    grows: bool = False
-    # (n,): Of the points of a PWL at uneven times, s; None for samples. `spacing` is then the mean distance in the run.
+    # (n,): Of the points of a PWL at uneven times, or of two times that are no samples, s; None for samples
     times: FloatArray | None = None
 
     @property
     def stop(self) -> float:
-        if self.times is not None:
-            return float(self.times[-1])
-        return self.start + max(self.last - self.first, 1) * self.spacing
+        return self.start + (self.last - self.first) * self.spacing if self.times is None else float(self.times[-1])
 
     def values(self, wave: Samples | PWL) -> FloatArray:
         """The source at the limits of the steps, V."""
-        if isinstance(wave, Samples) and self.first < self.last:
-            return wave.between(self.first, self.last + 1)
-        return wave.value([self.start, self.start + self.spacing] if self.times is None else self.times)
+        if self.times is not None:
+            return wave.value(self.times)
+        assert isinstance(wave, Samples)
+        return wave.between(self.first, self.last + 1)
 
 
 def driving(problem: Problem) -> tuple[int, Samples | PWL | None]:
@@ -373,19 +369,14 @@ def _points(problem: Problem, wave: PWL) -> FloatArray:
     return wave.remember(("points", t0, t1), dense, 1)
 
 
-def spacing_of(wave: Samples | PWL) -> float:
-    """The (mean) distance of the samples or points, s."""
-    return 1.0 / wave.rate if isinstance(wave, Samples) else (wave.times[-1] - wave.times[0]) / (len(wave.times) - 1)
-
-
 def pieces_of(problem: Problem) -> list[Piece]:
     """The pieces of a run with a moving area that is driven by a recording of enough samples; else none."""
     _, wave = driving(problem) if problem.scene.coupled else (0, None)
     if wave is None:
         return []
     if isinstance(wave, PWL):
-        points, spacing = _points(problem, wave), spacing_of(wave)
-        edges = [*range(0, points.size - 1, PIECE), points.size - 1]
+        points = _points(problem, wave)
+        spacing, edges = float(np.diff(points).mean()), [*range(0, points.size - 1, PIECE), points.size - 1]
         return [Piece(float(points[a]), spacing, times=points[a : b + 1]) for a, b in itertools.pairwise(edges)]
     spacing, t0, t1 = 1.0 / wave.rate, problem.t_start, problem.t_stop
     first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
@@ -393,16 +384,15 @@ def pieces_of(problem: Problem) -> list[Piece]:
     # In a PWL with few points the source is one long line in most of the run, of which other methods need few steps.
     if last - first < LEAST_SAMPLES or not (of_samples or last - first <= MOST_PER_POINT * problem.breakpoints().size):
         return []
-    grows, begin, end = problem.network.stack is None, wave.start + first * spacing, wave.start + last * spacing
+    begin, end = wave.start + first * spacing, wave.start + last * spacing
     early = begin - t0 > 1e-6 * spacing
     edges = [first, *range((first // PIECE + 1) * PIECE, last, PIECE), last]
-    if grows and not early:
+    if problem.network.stack is None and not early:
+        # The first step of a network is a piece of its own: see `LaneMarch.follow`.
         edges.insert(1, first + 1)
     out = [Piece(wave.start + a * spacing, spacing, a, b) for a, b in itertools.pairwise(edges) if a < b]
     if early:
-        out.insert(0, Piece(t0, begin - t0))
-    if grows:
-        out[0] = replace(out[0], grows=True)
+        out.insert(0, Piece(t0, begin - t0, times=np.array([t0, begin])))
     if t1 - end > 1e-6 * spacing:
-        out.append(Piece(end, t1 - end))
+        out.append(Piece(end, t1 - end, times=np.array([end, t1])))
     return out

@@ -25,7 +25,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Self, cast
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
@@ -102,6 +102,7 @@ class LaneForm(ABC):
     missed: float
     missed_bend: float
     held: float  # Capacitance of what stores the charges, F
+    bent: ClassVar[bool] = False  # Whether N is a drive, as in a network
 
     @abstractmethod
     def start(self, problem: Problem) -> tuple[FloatArray, float]:
@@ -110,10 +111,6 @@ class LaneForm(ABC):
     @abstractmethod
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
         """The state at modes as in `start` and `t` (s), where the source has the value `u_last`."""
-
-    def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        """Rows of a record from `out` (., n), the values of `rows` and the charges' rates."""
-        return out.T
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
@@ -145,11 +142,6 @@ class LaneForm(ABC):
         charges = rows.k.size - self.flows
         judged = Shown(*(np.concatenate([a, b[charges:]]) for a, b in zip(nodes, rows, strict=True)))
         return replace(self, lanes=lanes, active=active, rows=rows, judged=judged)
-
-    @property
-    def bent(self) -> bool:
-        """Whether N is a drive, as in a network."""
-        return not self.mobile and self.lanes.feed.shape[1] > self.lanes.tap_s.size
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the lanes' state, and for weights of steps (2, rows, 1 or lanes): of length 0, and by `weigh`."""
@@ -433,6 +425,7 @@ class NetworkForm(LaneForm):
     """A network prepared for recordings; the charges are its last modes, where they are wanted."""
 
     reduced: Reduced
+    bent: ClassVar[bool] = True
 
     def start(self, problem: Problem) -> tuple[FloatArray, float]:
         start, reduced, c = problem.initial, self.reduced, self.lanes
@@ -457,11 +450,6 @@ class NetworkForm(LaneForm):
         s, sign = np.zeros(len(problem.network.waveforms)), np.ones(problem.scene.net.gap.size)
         s[self.reduced.source], sign[self.reduced.moving] = u_last, 1.0 if xi >= 0.0 else -1.0
         return State(t, y, s, sign, problem.scene.charge_law)
-
-    def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        # Charges that are not wanted stay as they are.
-        held = problem.initial.y[len(out) :, None] + np.zeros(out.shape[1])
-        return out.T if self.flows else np.concatenate([out, held]).T
 
 
 def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> NetworkForm | None:

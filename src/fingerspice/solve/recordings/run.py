@@ -16,9 +16,9 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.lanes.loops import flow, show
-from fingerspice.results.outcome import State, Status
+from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.block import OF_FORCE, Block, Piece, driving, pieces_of, ready, spacing_of
+from fingerspice.solve.recordings.block import OF_FORCE, Block, Piece, driving, pieces_of, ready
 from fingerspice.solve.recordings.form import PIECES, LaneForm, StackForm
 from fingerspice.solve.runs import Progress, Run, closed_form, excess_of
 from fingerspice.waveforms.sampling import on_grid
@@ -65,11 +65,8 @@ class NotMetError(LostError):
 class LaneMarch:
     """A recording of one finger in progress, piece by piece."""
 
-    # What changes from piece to piece.
-    _MARKED = (
-        "place", "t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak", "margin",
-        "z", "alike", "chance", "errors",
-    )  # fmt: skip
+    # What follows from the run alone, or is counted anew: all else changes from piece to piece.
+    _SETTLED = ("problem", "form", "rtol", "pieces", "wave", "expected", "least", "outputs")
 
     def __init__(self, problem: Problem, pieces: list[Piece], form: LaneForm, rtol: float, share: float = 1.0) -> None:
         # The error allowed is reduced to a `share` where errors of earlier pieces add up.
@@ -92,11 +89,6 @@ class LaneMarch:
         # Largest |xi| (V), and errors seen of gap voltage (V), force (N), nodes (V) and charges (C).
         self.peak, self.errors = 0.0, np.zeros(4)
 
-    @property
-    def state(self) -> State:
-        """The state reached."""
-        return self.form.state(self.problem, self.z, self.t, self.u_last)
-
     def outputs_at(self, t_out: FloatArray) -> FloatArray:
         """An array for outputs at these times, which begin to be counted from 0."""
         self.outputs = 0
@@ -105,13 +97,14 @@ class LaneMarch:
     def follow(self, t_out: FloatArray, out: FloatArray) -> None:
         """Integrate the next piece, and write the outputs before its end as rows of `out`; `LostError` where it cannot.
 
-        After the last piece the outputs at the end of the run follow. Of a piece that grows, all steps lie on one line
-        of the source, and become longer from a part of the shortest time constant on.
+        After the last piece the outputs at the end of the run follow. Where a run of a network starts, the source may
+        jump, after which fast modes decay that no step of a sample resolves: there the steps, on one line of the
+        source, grow from a part of the shortest time constant on.
         """
-        piece = self.pieces[self.place]
+        piece, grows = self.pieces[self.place], self.place == 0 and self.problem.network.stack is None
         values = piece.values(self.wave)
         self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
-        if piece.grows:
+        if grows:
             span = piece.stop - piece.start
             shortest = min(EARLY / float(self.form.lanes.rates.max()), span / (PIECES * GROWN))
             share = np.append(0.0, np.geomspace(shortest / span, 1.0, PIECES * GROWN))
@@ -122,20 +115,21 @@ class LaneMarch:
         tries = self.steps == 0 and self.rtol < AT_ONCE[self.form.bent] and values.size > 4 * FIRST
         for size in (FIRST, values.size - 1)[0 if tries else 1 :]:
             block = Block(self.form, values[: size + 1], h[:size], self.steps == 0)
-            excess = self._climb(block, LEAST_AT_START if piece.grows else LEAST_PEAK)
+            excess = self._climb(block, LEAST_AT_START if grows else LEAST_PEAK)
         parts, self.peak = PARTS[self.level], max(float(block.peaks.max()), self.peak)
         self.errors = np.maximum(block.errors, self.errors)
         self.alike, self.chance, self.margin = block.alike, block.chance, min(self.margin, block.margin)
         self.steps += parts * block.n
         self._write(piece, block, parts, t_out, out)
         self.z, self.t, self.u_last = block.end(), piece.stop, float(values[-1])
-        if piece.grows:
-            self.level = 0
-        elif excess < COARSER and self.level > 0:
-            self.level -= 1
+        self.level = 0 if grows else max(self.level - int(excess < COARSER), 0)
         self.place += 1
         if self.place == len(self.pieces):
-            self._finish(t_out, out)
+            # The outputs at the end of the run, with the source's slope after it.
+            count, after = t_out.size - self.outputs, 1e-3 * max(piece.spacing for piece in self.pieces)
+            (rise,) = np.diff(self.wave.value([self.problem.t_stop, self.problem.t_stop + after])) / after
+            at_end = np.repeat(self.z[:, None, None], count, axis=2)
+            self._show(np.full(count, self.u_last), np.full(count, rise), at_end, out)
 
     def _climb(self, block: Block, share: float) -> float:
         """Solve a block, with ever more steps until its error is met; the excess of the errors stated."""
@@ -176,8 +170,6 @@ class LaneMarch:
         first, n = self.outputs, block.n
         slack = 8e-16 * (abs(piece.start) + n * piece.spacing)
         last = first + int(np.searchsorted(t_out[first:], piece.stop - slack))
-        if last == first:
-            return
         t, times = t_out[first:last], piece.times
         if t.size == n and (
             on_grid(t, piece.start, piece.spacing, slack) if times is None else np.abs(t - times[:-1]).max() <= slack
@@ -216,15 +208,6 @@ class LaneMarch:
         for by, share, own in zip(form.shown[charges:], shown.bends[charges:], rows[len(shown.k) :], strict=True):
             flow(form.lanes, by, float(share), x, slope, first, count, kept, xi, own)
 
-    def _finish(self, t_out: FloatArray, out: FloatArray) -> None:
-        """Write the outputs at the end of the run, with the source's slope after it."""
-        count, after = t_out.size - self.outputs, 1e-3 * spacing_of(self.wave)
-        if count:
-            x, slope = np.full(count, self.u_last), np.zeros(count)
-            if self.form.flows:
-                slope += float(np.diff(self.wave.value([self.problem.t_stop, self.problem.t_stop + after]))[0]) / after
-            self._show(x, slope, np.repeat(self.z[:, None, None], count, axis=2), out)
-
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
         """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C)."""
         form, u_peak = self.form, self.problem.scene.u_peak
@@ -245,12 +228,13 @@ class LaneMarch:
 
     def mark(self) -> dict[str, Any]:
         """The state of the integration: attributes, which another march through the same run may be given."""
-        return {name: getattr(self, name) for name in self._MARKED}
+        return {name: value for name, value in vars(self).items() if name not in self._SETTLED}
 
     def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
         """The run so far, with the given outputs."""
         stats = {"steps": self.steps, "rejected": self.refused, "zeros": 0}
-        run = Run(t, left, rows, Status.SUCCESS, self.evaluated, stats, self.state)
+        state = self.form.state(self.problem, self.z, self.t, self.u_last)
+        run = Run(t, left, rows, Status.SUCCESS, self.evaluated, stats, state)
         run.gaps, run.node_error, run.charge_error = self._stated(self.errors, self.peak)
         run.margin, run.by_layer = self.margin, self.problem.network.stack is not None
         return run
@@ -281,7 +265,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None) -> Ru
             continue
         except LostError:
             return None
-        run = march.run(t_out, problem.left, march.form.recorded(problem, out))
+        run = march.run(t_out, problem.left, out.T)
         run.stats["rejected"] += refused
         # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
         if excess_of(run.gaps, problem.rounding) <= rtol:

@@ -21,7 +21,7 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.engine.lockstep.card import require_card
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
-from fingerspice.results.solution import MEANS
+from fingerspice.results.solution import DERIVED, MEANS
 from fingerspice.solve.simulation import RTOL_RANGE, rtol_given, simulate
 from fingerspice.studies.batch.lockstep import LOCKSTEP, Ladder, LockstepForm, Slopes, lockstep_form, why_alone
 from fingerspice.studies.steady import steady_state
@@ -30,11 +30,10 @@ from fingerspice.waveforms.waveform import Sum, refuse, require
 if TYPE_CHECKING:
     from xarray import Dataset
 
-#: Signals whose figures a batch has, and the kinds of figures.
-SIGNALS_OF_BATCH = ("f_el", "f_t", "friction", "u_gap", "area")
+# Kinds of figures.
 _KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
 # The signal and the kind of every output.
-_OUTPUTS = {f"{signal}_{kind}": (signal, kind) for signal in SIGNALS_OF_BATCH for kind in _KINDS}
+_OUTPUTS = {f"{signal}_{kind}": (signal, kind) for signal in DERIVED for kind in _KINDS}
 _OUTPUTS["u_gap"] = "u_gap", ""
 LEAST_RTOL = 1e-12
 ONE_BY_ONE, REFUSED, FAILED = 1, 2, 3
@@ -78,7 +77,7 @@ class Task:
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in self.outputs:
             if name not in _OUTPUTS:
-                kinds, signals = ", ".join(f"_{kind}" for kind in _KINDS), ", ".join(SIGNALS_OF_BATCH)
+                kinds, signals = ", ".join(f"_{kind}" for kind in _KINDS), ", ".join(DERIVED)
                 raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
         require(bool(self.outputs), "outputs", "empty", "one or more names")
         self.traced = "u_gap" in self.outputs
@@ -106,14 +105,13 @@ class Task:
 
     def frequencies(self, of_skin: bool = False) -> FloatArray:
         """The source's frequency in every scene, Hz: that of several together, or the one that a SKIN follows."""
-        on = [e for e in driving_sources(self.circuit) if e.waveform is not None and e.waveform.period is not None]
-        waves = [e.waveform for e in on if e.waveform is not None]
+        every = {e.name: e.waveform for e in driving_sources(self.circuit) if e.waveform is not None}
+        on = {f"{name}.frequency": (wave, wave.period) for name, wave in every.items() if wave.period is not None}
+        given = [self.scenes[path] for path in on if path in self.scenes]
         if len(on) == 1:
-            given = self.scenes.get(f"{on[0].name}.frequency")
-            tone = waves[0].tone() if of_skin else None
-            return given if given is not None else np.full(self.n, tone or 1.0 / (waves[0].period or math.nan))
-        moved = any(f"{e.name}.frequency" in self.scenes for e in on)
-        period = None if of_skin or moved or not on else Sum(tuple(waves)).period
+            ((wave, own),) = on.values()
+            return given[0] if given else np.full(self.n, (wave.tone() if of_skin else None) or 1.0 / own)
+        period = None if of_skin or given or not on else Sum(tuple(wave for wave, _ in on.values())).period
         if period is None:
             allowed = "one, where periods, u_gap or the skin's frequency follow it, or several of fixed frequencies"
             raise InputError(f"{len(on)} sources have a period; allowed: {allowed} in a ratio of whole numbers")
@@ -384,8 +382,7 @@ def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> t
     error = max((x / size for x, size in zip((off.u_gap, off.f_el), sizes, strict=True) if size > 0.0), default=0.0)
     if not paths:
         # What there is not is None, and so NaN.
-        asked = [name for name in task.outputs if name != "u_gap"]
-        values = {name: np.asarray(run._figure(*_OUTPUTS[name]), float) for name in asked}
+        values = {name: np.asarray(run._figure(*_OUTPUTS[name]), float) for name in task.outputs if name != "u_gap"}
         if task.traced:
             values["u_gap"] = np.atleast_1d(np.asarray(run.u_gap, float))[: -1 if task.periodic else None]
         return values, error

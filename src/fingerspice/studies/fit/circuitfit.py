@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -174,12 +174,7 @@ class Task(Problem):
     rtol: float
     charge_law: str | None
     watch: Callable[[], None]  # Called before every evaluation
-
-    @property
-    def box(self) -> FloatArray:
-        """Bounds also where none are given, far from the start: there are no likely values, and slow runs."""
-        (low, high), near, far = self.bounds.T, self.initial / FARTHEST, self.initial * FARTHEST
-        return np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
+    reach: ClassVar[float] = FARTHEST  # There are no likely values beyond it, and slow runs
 
     def remedy(self, names: tuple[str, ...]) -> str:
         """A measurement that would add what is missing: at another voltage, frequency or load."""
@@ -318,19 +313,13 @@ class Fit(FitResult):
         data, circuit = self.data, self.circuit
         signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
         signal = f"mean {signal}" if data.name.endswith("_mean") else signal
-        # What changed most stands along the axis, and every value of the rest has a curve.
-        varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
-        axes = [(meaning_of(circuit, path), circuit.parameters[path].unit, x) for path, x in varying]
+        axes = [(meaning_of(circuit, path), circuit.parameters[path].unit, x) for path, x in data.varying.items()]
         numbers = np.arange(1.0, data.values.size + 1.0, dtype=np.float64)
         # Conditions that vary go without times.
         alone = ("measurement", "", numbers) if data.t is None else ("time", "s", data.t)
-        (label, unit, x), *others = axes or [alone]
-        groups = data.groups.items() if varying else ()
-        keys = [[f"{column} = {one}" for one in of] for column, of in groups]
-        keys += [[f"{name} = {y:g} {unit}".rstrip() for y in values] for name, unit, values in others]
-        names = list(map(", ".join, zip(*keys, strict=True))) or ["measured and fitted"] * data.values.size
-        columns = x, data.values, self.predicted, self.sigma
-        return [(names, columns, f"{label} [{unit}]" if unit else label, signal, MEASURED[data.signal])]
+        keys = [[f"{column} = {one}" for one in of] for column, of in data.groups.items() if axes]
+        columns = data.values, self.predicted, self.sigma
+        return [self._panel(axes or [alone], keys, signal, MEASURED[data.signal], *columns)]
 
     def to_dict(self) -> dict[str, Any]:
         return super().to_dict() | {
@@ -410,9 +399,6 @@ def fit(
         raise InputError(f"the circuit has {gaps} GAPs; allowed: one, to which the data belong")
     if average == "run" and circuit.tran is None and measured.name.endswith("_mean"):
         raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
-    own = {f"{e.name}.f" for e in circuit.by_device("SKIN")} & {*measured.conditions, *paths}
-    if skin == "follow" and own and measured.name.endswith("_mean"):
-        raise InputError(f"skin='follow' and {own.pop()} are both given; allowed: one of them")
     bar, begun, count = Bar("fitting", endless=True), time.perf_counter(), itertools.count(1)
 
     def watch() -> None:
@@ -468,7 +454,7 @@ def _request(
 
 
 def _fitted(task: Task, starts: int) -> Fit:
-    from scipy.stats import norm, t
+    from scipy.stats import t
 
     data, n = task.data, task.data.values.size
     ends = [followed(task.residuals, task.box, begin) for begin in _starts(task, starts)]
@@ -492,11 +478,10 @@ def _fitted(task: Task, starts: int) -> Fit:
             # Shares that fit to the last bit are the likelier ones.
             if least == 0.0 or 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY:
                 task, ends, best = shares, others, other
-    variance, reach = math.inf, math.inf
-    if data.sigma is not None:
-        variance, reach = 1.0, float(norm.ppf(0.975))
-    elif freedom > 0:
-        variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
+    # Of a known sigma Student's t is that of infinitely many degrees of freedom; with none left, nothing is known.
+    left = math.inf if data.sigma is not None else freedom
+    variance = 1.0 if left == math.inf else best.objective / left if left > 0 else math.inf
+    reach = float(t.ppf(0.975, left)) if left > 0 else math.inf
     # The geometric mean of one value is that value to the last digit.
     means = {path: best.values[np.unique(at)] for path, at in task.places.items()}
     (of,) = data.groups.values() or ((),)

@@ -63,14 +63,10 @@ class Relation(NamedTuple):
         """The values as a contact has them (Eqs. 1 to 6), shape (n,)."""
         if self.kind == "indentation":
             return np.asarray(contact.beta * self.indentation**contact.n)
-        resting = self.kind == "area"
-        out = np.empty(self.values.size)
-        for i, (fn, u) in enumerate(zip(self.fn.tolist(), self.u_gap.tolist(), strict=True)):
-            packed = replace(contact, f_n=fn, mu=0.0 if resting else contact.mu).packed
-            out[i] = area = ridge_area(abs(u), packed)
-            if self.kind == "f_t":
-                out[i] = contact.mu * (fn + packed[4] * u * u * area)
-        return out
+        own = replace(contact, mu=0.0) if self.kind == "area" else contact
+        under = zip(self.fn.tolist(), np.abs(self.u_gap).tolist(), strict=True)
+        area = np.array([ridge_area(u, replace(own, f_n=fn).packed) for fn, u in under])
+        return area if self.kind != "f_t" else contact.mu * (self.fn + contact.stress(self.u_gap) * area)
 
 
 def _relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, ...]:
@@ -214,16 +210,10 @@ class ContactFit(FitResult):
     def _panels(self) -> list[Any]:
         panels = []
         for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):
-            # The condition along the axis, and another, of which every value has a curve.
-            x, label, others, name = one.fn, "normal load [N]", one.u_gap, "gap voltage = {:g} V"
+            under = [("normal load", "N", one.fn), ("gap voltage", "V", one.u_gap)]
             if one.kind == "indentation":
-                x, label, others = 1e3 * one.indentation, "indentation [mm]", np.zeros(one.fn.size)
-            elif np.unique(one.u_gap).size > np.unique(one.fn).size:
-                x, label, others, name = one.u_gap, "gap voltage [V]", one.fn, "normal load = {:g} N"
-            order = np.argsort(others, kind="stable")
-            names = [name.format(other) if np.ptp(others) > 0.0 else one.name for other in others[order]]
-            columns = [column[order] for column in (x, one.values, fitted, sigma)]
-            panels.append((names, columns, label, one.name, MEASURED.get(one.kind, "m^2")))
+                under = [("indentation", "mm", 1e3 * one.indentation)]
+            panels.append(self._panel(under, [], one.name, MEASURED.get(one.kind, "m^2"), one.values, fitted, sigma))
         return panels
 
     def to_dict(self) -> dict[str, Any]:
@@ -330,9 +320,9 @@ def fit_contact(
 
 def _gap(circuit: Circuit, finger: str | None) -> str:
     gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
-    several, known = finger is None and len(gaps) > 1, ", ".join(gaps.values())
+    known = ", ".join(gaps.values())
     refuse(not gaps, "this circuit has no GAP; allowed: a circuit with a finger, whose contact is fitted")
-    refuse(several, f"this circuit has several GAPs; allowed: finger= one of {known}")
+    refuse(finger is None and len(gaps) > 1, f"this circuit has several GAPs; allowed: finger= one of {known}")
     name = next(iter(gaps.values())) if finger is None else gaps.get(finger.lower(), "")
     require(bool(name), "finger", repr(finger), f"the name of a GAP, {known}")
     law = circuit[name].law
@@ -391,7 +381,7 @@ def _errors(task: Task, best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray
     (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
     residuals, and a part in the variance of a parameter; without a measure of one that has a part, nothing is known.
     """
-    from scipy.stats import norm, t
+    from scipy.stats import t
 
     covariance, left = best.covariance, np.array([freedom for _, _, freedom in pools])
     parts = np.array([np.sum((covariance @ best.by_log[at].T) ** 2, axis=1) for _, at, _ in pools])
@@ -399,7 +389,7 @@ def _errors(task: Task, best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray
     with np.errstate(divide="ignore", invalid="ignore"):
         each = shares**2 / np.where(left >= _FEWEST, left, 0.0)[:, None]
         inverse = np.where(shares > _NO_PART, each, 0.0).sum(axis=0)
-        reach = np.where(inverse > 0.0, t.ppf(0.975, 1.0 / inverse), norm.ppf(0.975))
+        reach = t.ppf(0.975, 1.0 / inverse)
     known, notes = np.isfinite(inverse), list[str]()
     for name, at, freedom in pools:
         if freedom < _FEWEST:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -101,7 +101,7 @@ REFUSED, NOT_FOUND = 1e6, 0.5e12
 _CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
 # Step of the differences in a parameter's logarithm, at which those of fourth order are exact to rounding.
 _STEP = 1e-3
-#: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
+#: A profile is followed up to this factor where no bounds are, as is a search whose runs would be slow farther away.
 FARTHEST = 1e3
 # Singular values of the derivatives below this share of the largest are rounding; residuals this unlikely by noise of
 # the given sigma are named.
@@ -119,6 +119,7 @@ class Problem:
     #: (n_parameter, 2): Smallest and largest values, 0 and infinity by default; made by `begun`
     bounds: FloatArray = field(default_factory=lambda: np.empty((0, 2)), kw_only=True)
     profiles: tuple[str, ...] = field(default=(), kw_only=True)  # Names whose profiles are wanted; made by `begun`
+    reach: ClassVar[float] = math.inf  # A parameter is looked for up to this factor from its start without bounds
 
     @property
     def initial(self) -> FloatArray:
@@ -127,8 +128,9 @@ class Problem:
 
     @property
     def box(self) -> FloatArray:
-        """The bounds within which is searched, shape (n_parameter, 2)."""
-        return self.bounds
+        """The bounds within which is searched, shape (n_parameter, 2): `reach` from the start where none are given."""
+        (low, high), near, far = self.bounds.T, self.initial / self.reach, self.initial * self.reach
+        return np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
 
     def misses(self, values: FloatArray) -> FloatArray:
         """Residuals over their scale, shape (n,)."""
@@ -157,10 +159,10 @@ class Problem:
         """With bounds and profiles as given, and a start moved into the bounds."""
         n, count, circuit, box = self.scale.size, len(self.paths), self.circuit, []
         refuse(n < count, f"{n} data cannot tell {count} parameters; allowed: at least as many data")
-        given, fitted = {path.lower(): tuple(pair) for path, pair in bounds.items()}, ", ".join(self.paths)
+        given, own = {path.lower(): tuple(pair) for path, pair in bounds.items()}, {*map(str.lower, self.paths)}
         for path in bounds:
-            known = path.lower() in map(str.lower, self.paths)
-            refuse(not known, f"bounds names {path}, which is not fitted; allowed: {fitted}")
+            said = f"bounds names {path}, which is not fitted; allowed: {', '.join(self.paths)}"
+            refuse(path.lower() not in own, said)
         for path in self.paths:
             pair = given.get(path.lower(), (0.0, math.inf))
             wrong = len(pair) != 2 or not 0.0 <= pair[0] < pair[1]
@@ -244,8 +246,8 @@ def followed(
 
 
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
-# the error of a parameter, in its logarithm, from which on nothing is known of it.
-_TOGETHER, _NOTABLE, _UNKNOWN = 0.98, 0.05, 0.7
+# the error of a parameter, in its logarithm, from which on nothing is known of it; the least correlation in a report.
+_TOGETHER, _NOTABLE, _UNKNOWN, _TOLD = 0.98, 0.05, 0.7, 0.1
 # A value this close to a bound, relative, is at it; an interval that reaches farther, in the logarithm, has no ends.
 _AT_BOUND, _NO_END = 1e-6, 50.0
 # Of profiles: growth of the distance from the value, in its logarithm, and error of an interval's end over that
@@ -302,31 +304,30 @@ class FitResult(Shown):
         `variance` is that of the residuals over their scale, and `half` half an interval over a standard error of the
         logarithm, for all parameters or each.
         """
-        covariance, estimates, notes, rooms = best.covariance, dict[str, Estimate](), list[str](), dict[str, float]()
+        covariance, values, known = best.covariance, best.values, task.circuit.parameters
         spread = np.sqrt(np.diag(covariance))
-        correlation = covariance / np.outer(spread, spread)
-        error = np.sqrt(np.diag(covariance) * variance).tolist()
-        rows = zip(
-            task.names, task.paths, task.box, task.initial.tolist(), best.values.tolist(), error,
-            *(np.broadcast_to(x, spread.shape).tolist() for x in (variance, half)), strict=True,
-        )  # fmt: skip
-        for name, path, box, start, value, off, square, far in rows:
-            at_bound = bool(np.any(np.abs(value / box[np.isfinite(box) & (box > 0.0)] - 1.0) < _AT_BOUND))
-            ratio = math.exp(far * off) if far * off < _NO_END else math.inf
-            # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal
-            # distribution and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
-            unit, rooms[name] = task.circuit.parameters[path].unit, square * far**2
-            estimates[name] = Estimate(name, unit, value, start, value * off, value / ratio, value * ratio, at_bound)
-            if at_bound:
-                told = f"{value:g} {unit}".rstrip()
-                notes.append(f"{name} is at its bound, {told}: its interval is not that of a free parameter.")
-        for (i, a), (j, b) in itertools.combinations(enumerate(task.names), 2):
-            if abs(both := correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
+        correlation, error = covariance / np.outer(spread, spread), np.sqrt(np.diag(covariance) * variance)
+        reach = half * error
+        ratio = np.where(reach < _NO_END, np.exp(np.minimum(reach, _NO_END)), math.inf)
+        with np.errstate(divide="ignore"):
+            at_bound = np.any(np.abs(values[:, None] / task.box - 1.0) < _AT_BOUND, axis=1)
+        columns = values, task.initial, values * error, values / ratio, values * ratio, at_bound
+        units = (known[path].unit for path in task.paths)
+        rows = zip(task.names, units, *(x.tolist() for x in columns), strict=True)
+        estimates = {row[0]: Estimate(*row) for row in rows}
+        # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal distribution
+        # and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
+        rooms = dict(zip(task.names, np.broadcast_to(variance * half**2, spread.shape).tolist(), strict=True))
+        off = dict(zip(task.names, error.tolist(), strict=True))
+        bound = (f"{e.path} is at its bound, {e.value:g} {e.unit}".rstrip() for e in estimates.values() if e.at_bound)
+        notes = [f"{said}: its interval is not that of a free parameter." for said in bound]
+        for a, b, both in _pairs(estimates, correlation, _TOGETHER):
+            if max(off[a], off[b]) > _NOTABLE:
                 said = f"{a} and {b} are not told apart (correlation {both:+.4f}): they change these data in almost"
                 notes.append(f"{said} the same way, and only a combination of both is known. {task.remedy((a, b))}")
         named = " ".join(notes)
-        for name, off in zip(task.names, error, strict=True):
-            if not off < _UNKNOWN and name not in named:
+        for name in task.names:
+            if not off[name] < _UNKNOWN and name not in named:
                 said = f"Of {name} these data tell next to nothing: its error is larger than itself."
                 notes.append(f"{said} {task.remedy((name,))}")
         return cls(
@@ -337,6 +338,17 @@ class FitResult(Shown):
 
     def _panels(self) -> list[Any]:
         raise NotImplementedError
+
+    @staticmethod
+    def _panel(
+        under: Sequence[tuple[str, str, Any]], keys: Sequence[Sequence[str]], shown: str, unit: str, *columns: Any
+    ) -> Any:
+        """A panel of `plot_panels`: of the conditions that which changed most is the axis, and the rest name curves."""
+        (label, axis, x), *others = sorted(under, key=lambda one: -np.unique(one[2]).size)
+        varying = [one for one in others if np.ptp(one[2]) > 0.0]
+        rest = [[f"{name} = {y:g} {of}".rstrip() for y in values] for name, of, values in varying]
+        curves = list(map(", ".join, zip(*keys, *rest, strict=True))) or [shown] * x.size
+        return curves, (x, *columns), f"{label} [{axis}]" if axis else label, shown, unit
 
     def _columns(self) -> dict[str, Any]:
         """Columns of the table, by their heads."""
@@ -353,12 +365,6 @@ class FitResult(Shown):
         columns = self._columns()
         return write_csv(path, columns, zip(*columns.values(), strict=True))
 
-    @property
-    def _pairs(self) -> list[tuple[str, str, float]]:
-        """Every two parameters, and the correlation of their errors where it is 0.1 or more."""
-        named = itertools.combinations(enumerate(self.estimates), 2)
-        return [(a, b, both) for (i, a), (j, b) in named if abs(both := float(self.correlation[i, j])) >= 0.1]
-
     def _paged(self, head: str, about: Sequence[str], *end: str) -> Page:
         """A page of what was fitted to what (`head`), the residuals (`about`), and everything else."""
         rows = [
@@ -371,7 +377,7 @@ class FitResult(Shown):
         table = Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
         effort = f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
         lines: list[str | Table] = [f"{head}, {effort}", *about, "", table]
-        if pairs := [f"{a}, {b}: {both:+.3f}" for a, b, both in self._pairs]:
+        if pairs := [f"{a}, {b}: {both:+.3f}" for a, b, both in _pairs(self.estimates, self.correlation, _TOLD)]:
             lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
         for one in self.profiles.values():
             ends = f"{one.low:.4g} to {one.high:.4g} {self.estimates[one.path].unit}, {one.shape}"
@@ -386,22 +392,17 @@ class FitResult(Shown):
         estimates, square, count, k = self.estimates, self.objective, self.count, len(self.estimates)
         level = count * math.log(max(square, 1e-300) / count)
         wide = max(map(len, estimates)) + 1
-        lines = [
-            "[[Fit Statistics]]",
-            "    # fitting method   = least_squares",
-            f"    # function evals   = {self.evaluations}",
-            f"    # data points      = {count}",
-            f"    # variables        = {k}",
-            f"    chi-square         = {square:.8g}",
-            f"    reduced chi-square = {square / (count - k) if count > k else math.inf:.8g}",
-            f"    Akaike info crit   = {level + 2.0 * k:.8g}",
-            f"    Bayesian info crit = {level + k * math.log(count):.8g}",
-            "[[Variables]]",
-        ]
+        figures = {
+            "# fitting method": "least_squares", "# function evals": self.evaluations, "# data points": count,
+            "# variables": k, "chi-square": f"{square:.8g}",
+            "reduced chi-square": f"{square / (count - k) if count > k else math.inf:.8g}",
+            "Akaike info crit": f"{level + 2.0 * k:.8g}", "Bayesian info crit": f"{level + k * math.log(count):.8g}",
+        }  # fmt: skip
+        lines = ["[[Fit Statistics]]", *(f"    {name:<18} = {x}" for name, x in figures.items()), "[[Variables]]"]
         for name, e in estimates.items():
             share = f"({100.0 * e.error / e.value:.2f}%) (init = {e.initial:.7g})"
             lines.append(f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} {share}")
-        if pairs := sorted(self._pairs, key=lambda pair: -abs(pair[2])):
+        if pairs := sorted(_pairs(estimates, self.correlation, _TOLD), key=lambda pair: -abs(pair[2])):
             lines.append("[[Correlations]] (unreported correlations are < 0.100)")
         return "\n".join([*lines, *(f"    C({a}, {b}) = {both:+.4f}" for a, b, both in pairs)])
 
@@ -412,6 +413,12 @@ class FitResult(Shown):
             "objective": self.objective, "notes": list(self.notes),
             "profiles": [{key: np.asarray(x).tolist() for key, x in vars(p).items()} for p in self.profiles.values()],
         }  # fmt: skip
+
+
+def _pairs(names: Iterable[str], correlation: FloatArray, least: float) -> list[tuple[str, str, float]]:
+    """Every two parameters whose errors are correlated by this or more, and their correlation."""
+    named = itertools.combinations(enumerate(names), 2)
+    return [(a, b, both) for (i, a), (j, b) in named if abs(both := float(correlation[i, j])) >= least]
 
 
 def _profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profile:

@@ -8,13 +8,14 @@ from collections.abc import Mapping
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fingerspice import sets
-from fingerspice.base.arrays import FloatArray, Remembering, real_number, real_numbers, whole_number
+from fingerspice.base.arrays import FloatArray, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import own_path, require_circuit
@@ -33,12 +34,13 @@ MOST_SCENES, MOST_SAMPLES, MOST_STORED_SAMPLES = 1 << 26, 1 << 20, 1 << BITS
 QUANTILES = (0.05, 0.5, 0.95)
 # Quantiles are taken no nearer to 0 and 1 than this, so that a distribution without bounds gives finite values.
 _EDGE = 1e-12
+_DRAWING = Lock()
 # Resamples of the population for the intervals of the indices. (scipy's own cannot be given a seed.)
 RESAMPLES = 499
 _NUMBERS = "a number, an array of numbers, or a frozen distribution of scipy.stats such as norm(3.5e-6, 0.3e-6)"
 
 
-class Plan(Remembering):
+class Plan:
     """Parameters of a circuit that make a grid, those that are drawn, and those that are one number, by name.
 
     Names are paths, several paths with commas, whose numbers are factors, or kinds of sets, whose numbers count them.
@@ -51,6 +53,7 @@ class Plan(Remembering):
         require(good, "parameters", asked, "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
         self.n, self.seed = n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
         self.count = n  # Draws of a part: a power of two
+        self._points: Any = None  # The sequence that they come from
         power = most.bit_length() - 1
         require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
         # The paths of each name, with the value that its numbers are factors of, or the values of the sets, (n_set,)
@@ -118,33 +121,22 @@ class Plan(Remembering):
         points = np.clip(points, _EDGE, 1.0 - _EDGE)
         return {path: np.asarray(law.ppf(points[:, i]), float) for i, (path, law) in enumerate(self.drawn.items())}
 
-    def _bits(self, start: int, count: int) -> NDArray[np.int64]:
-        """Bits of so many points of the unit cube from one on, shape (count, n_drawn), which a process makes once."""
-        from scipy.stats import qmc
-
-        def bits() -> NDArray[np.int64]:
-            engine = qmc.Sobol(len(self.drawn), scramble=True, bits=BITS, rng=self.seed)
-            if start:
-                engine.fast_forward(start)
-            return np.asarray(engine.random(count) * 2.0**BITS, np.int64)
-
-        return self.remember(("bits", start, count), bits, BITS + 1)
-
     # Two chunks may run at once, and those after them mostly have the same draws.
     @lru_cache(2)  # noqa: B019
     def draws(self, number: int = 0) -> dict[str, FloatArray]:
-        """Values of the drawn parameters in the part with this number, shape (count,) each.
+        """Values of the drawn parameters in the part with this number, shape (count,) each."""
+        from scipy.stats import qmc
 
-        The bits of a Sobol point are a linear function of those of its index: point i + j, of two indices without a
-        common bit, is the sum (exclusive or) of points i, j and 0.
-        """
         if not self.drawn:
             return {}
-        bits = first = self._bits(0, self.count)
-        for i in range(number.bit_length()):
-            if number >> i & 1:
-                bits = bits ^ (self._bits(self.count << i, 1) ^ first[0])
-        return self.quantiles(np.asarray(bits * 2.0**-BITS, float))
+        start = number * self.count
+        with _DRAWING:
+            # A sequence goes forward only, and parts are mostly asked for one after the other.
+            if self._points is None or self._points.num_generated > start:
+                self._points = qmc.Sobol(len(self.drawn), scramble=True, bits=BITS, rng=self.seed)
+            if ahead := start - self._points.num_generated:
+                self._points.fast_forward(ahead)
+            return self.quantiles(self._points.random(self.count))
 
 
 def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, tuple[str, ...], dict[str, FloatArray]]:
@@ -297,11 +289,24 @@ def sobol(
     outputs = options.get("outputs", ("f_el_mean",))
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     require("u_gap" not in outputs, "outputs", "u_gap", "figures, which are one number for each scene")
+    from scipy.stats import qmc
     from xarray import Dataset
 
-    # Every place of the grid: each of its parameters with one value, shape (1,).
-    places = [dict(zip(plan.grid, np.reshape(values, (-1, 1)), strict=True)) for values in product(*plan.grid.values())]
-    rows = [_indices(plan, place, outputs, confidence, options) for place in places]
+    # Two populations, for each parameter the first one with that parameter of the second, and each parameter by itself.
+    d = len(plan.drawn)
+    one, other = map(plan.quantiles, np.split(qmc.Sobol(2 * d, bits=64, rng=plan.seed).random(plan.n), 2, axis=1))
+    middle, ends = (plan.quantiles(np.tile(x, (d, 1)).T) for x in ([0.5] * len(QUANTILES), QUANTILES))
+    mixed = [{**base, name: to[name]} for base, to in ((one, other), (middle, ends)) for name in plan.drawn]
+    draws = {name: np.concatenate([part[name] for part in (one, other, *mixed)]) for name in plan.drawn}
+    rows: list[dict[str, FloatArray]] = []
+    for values in product(*plan.grid.values()):
+        # At every place of the grid each of its parameters has one value, shape (1,).
+        place = dict(zip(plan.grid, np.reshape(values, (-1, 1)), strict=True))
+        found = batch(plan.circuit, plan.spread(place, draws), **options)
+        lost, told = int(np.count_nonzero(found.status >= REFUSED)), ", ".join(found.attrs["failures"][:1])
+        said = f"{lost} of {found.sizes['scene']} scenes have no result ({told}), and indices need all"
+        refuse(lost, f"{said}; allowed: distributions that stay where the circuit works")
+        rows.append(_indices(plan, np.array([found[name].values for name in outputs]), confidence))
     data: dict[str, Any] = {}
     for i, output in enumerate(outputs):
         for kind in rows[0]:
@@ -310,33 +315,16 @@ def sobol(
             data[f"{output}_{kind}"] = ((*plan.grid, *own), each.reshape((*plan.sizes[:-1], *each.shape[1:])))
     coords = plan.coordinates | {"parameter": list(plan.drawn), "quantile": list(QUANTILES)}
     coords["unit"] = ("parameter", [plan.units[name] for name in plan.drawn])
-    data["at"] = (("parameter", "quantile"), [law.ppf(QUANTILES) for law in plan.drawn.values()])
+    data["at"] = (("parameter", "quantile"), list(ends.values()))
     return Dataset(data, coords, {"n": plan.n, "seed": plan.seed, "outputs": list(outputs)})
 
 
-def _indices(
-    plan: Plan, place: dict[str, FloatArray], outputs: tuple[str, ...], confidence: float, options: Mapping[str, Any]
-) -> dict[str, FloatArray]:
-    """Indices (n_output, d), their intervals, and mean and standard deviation of the outputs, at one place."""
-    from scipy.stats import qmc
-
-    # Two populations, for each parameter the first one with that parameter of the second, and each parameter by itself.
-    n, d, laws = plan.n, len(plan.drawn), list(plan.drawn.values())
-    points = qmc.Sobol(2 * d, bits=64, rng=plan.seed).random(n).T
-    pair = np.array([law.ppf(x) for law, x in zip(laws * 2, points, strict=True)], float).reshape(2, d, n)
-    middle = np.array([law.ppf(np.full(len(QUANTILES), 0.5)) for law in laws], float)
-    other, alone = (np.repeat(x[None], d, axis=0) for x in (pair[0], middle))
-    for k, law in enumerate(laws):
-        other[k, k], alone[k, k] = pair[1, k], law.ppf(QUANTILES)
-    draws = dict(zip(plan.drawn, np.concatenate([*pair, *other, *alone], axis=1), strict=True))
-    found = batch(plan.circuit, plan.spread(place, draws), **options)
-    if lost := int(np.count_nonzero(found.status >= REFUSED)):
-        raise InputError(f"{lost} of {found.sizes['scene']} scenes have no result ({found.attrs['failures'][0]}), and "
-                         "indices need all; allowed: distributions that stay where the circuit works")  # fmt: skip
-    values = np.array([found[name].values for name in outputs])
+def _indices(plan: Plan, values: FloatArray, confidence: float) -> dict[str, FloatArray]:
+    """Indices (n_output, d), their intervals, and mean and standard deviation, of outputs (n_output, n_scene)."""
     require(values.ndim == 2, "outputs", "one for each of several gaps", "figures of a circuit with one GAP")
+    n, d, count = plan.n, len(plan.drawn), len(values)
     a, b, mixed, single = np.split(values, [n, 2 * n, (2 + d) * n], axis=1)
-    mixed = np.moveaxis(mixed.reshape(len(outputs), d, n), 1, 0)
+    mixed = np.moveaxis(mixed.reshape(count, d, n), 1, 0)
     picks = np.random.default_rng(plan.seed).integers(0, n, (RESAMPLES, n))
     drawn = np.array([_saltelli(a[:, pick], b[:, pick], mixed[..., pick]) for pick in picks])
     low, high = np.quantile(drawn, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence], axis=0)
@@ -344,8 +332,7 @@ def _indices(
     return {
         "first": first, "first_low": low[0], "first_high": high[0],
         "total": total, "total_low": low[1], "total_high": high[1],
-        "mean": both.mean(axis=1), "std": both.std(axis=1),
-        "alone": single.reshape(len(outputs), d, len(QUANTILES)),
+        "mean": both.mean(axis=1), "std": both.std(axis=1), "alone": single.reshape(count, d, len(QUANTILES)),
     }  # fmt: skip
 
 
