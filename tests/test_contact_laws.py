@@ -118,6 +118,7 @@ def test_recordings_batches_sweeps_and_fits_take_a_law(tmp_path: Path) -> None:
     single = [fs.simulate(sine.replace({"Xgap.k": k})).f_el_mean for k in ks]
     batch = fs.batch(sine, {"Xgap.k": ks}, outputs=["f_el_mean"])
     np.testing.assert_allclose(batch.f_el_mean, single, rtol=1e-4)
+    assert batch.attrs["n_ordinary"] == 0
     np.testing.assert_allclose(fs.sweep(sine, {"Xgap.k": ks}, outputs=["f_el_mean"]).f_el_mean, single, rtol=1e-4)
     frequencies = np.array([30.0, 100.0, 300.0, 1000.0])
     forces = [fs.steady_state(sine.replace({"Vdrive": fs.Sine(140.0, f)}), rtol=1e-8).f_el_mean for f in frequencies]

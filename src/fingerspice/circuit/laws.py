@@ -96,8 +96,8 @@ class ContactLaw(Remembering):
                for name, x in self.parameters.items())  # fmt: skip
         return dataclasses.replace(gap, parameters=(*(known[name] for name in OF_EVERY_LAW), *own))
 
-    def contact(self, v: Mapping[str, float]) -> LawContact:
-        """The contact of a GAP with this law and these values, SI."""
+    def contact(self, v: Mapping[str, Any]) -> LawContact:
+        """The contact of a GAP with this law and these values, SI; arrays (n,) stand for one at each gap voltage."""
         own = {name: v[name] for name in ("d", "eps_r", "fn", "mu", *self.parameters)}
         return LawContact(v["d"], v["eps_r"], v["fn"], v["mu"], self.name, self.area, own)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import operator
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
@@ -372,15 +372,21 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
 _IN_MM = {"mm^2": 1e-6, "mm^2/N": 1e-6, "mm^2/N^m": 1e-6, "mm^4/N^2": 1e-12}
 
 
+def in_si(gap: Element, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of a GAP's parameters, numbers or arrays, in SI units; here, and nowhere else, mm are converted to m."""
+    v = {p.name: values[p.name] * _IN_MM.get(p.unit, 1.0) for p in gap.spec.parameters}
+    if "beta" in v:
+        v["beta"] = values["beta"] * 1e-6 * 1e3 ** v.get("n_exp", 0.0)
+    return v
+
+
 def contact_of(gap: Element) -> Contact:
-    """The contact of a GAP; here, and nowhere else, the paper's mm are converted to m."""
+    """The contact of a GAP."""
 
     def make() -> Contact:
         # A product may overflow, or a logarithm be taken of one that underflows.
         with suppress(ArithmeticError, ValueError):
-            v = {p.name: gap.values[p.name] * _IN_MM.get(p.unit, 1.0) for p in gap.spec.parameters}
-            if "beta" in v:
-                v["beta"] *= 1e-6 * 1e3 ** v.get("n_exp", 0.0)
+            v = in_si(gap, gap.values)
             if gap.law is not None:
                 return gap.law.contact(v)
             names = ("d", "eps_r", "fn", "mu", "alpha", "m_exp", "beta", "n_exp", "c2")

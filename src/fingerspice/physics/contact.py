@@ -181,7 +181,7 @@ class LawContact(Contact):
     function: Callable[[FloatArray, Mapping[str, float]], ArrayLike]
     values: Mapping[str, float]
 
-    def _given(self, u: FloatArray) -> FloatArray:
+    def given(self, u: FloatArray) -> FloatArray:
         """The function's areas at gap voltages of 0 V or more, (n,); NaN for those that are no positive number."""
         with np.errstate(all="ignore"):
             area = real_numbers(
@@ -201,7 +201,7 @@ class LawContact(Contact):
             Where the function's area is no positive number.
         """
         u = np.abs(np.asarray(u_gap, float))
-        area = self._given(u.ravel()).reshape(u.shape)
+        area = self.given(u.ravel()).reshape(u.shape)
         if np.isnan(area).any():
             raise InputError(self.ends(float(u[np.isnan(area)].min())))
         return area
@@ -214,12 +214,12 @@ class LawContact(Contact):
     def reach(self, u_max: float) -> float:
         """The gap voltage (V) up to which there is an area, at most `u_max`."""
         u = np.linspace(0.0, u_max, 65)
-        none = np.flatnonzero(np.isnan(self._given(u)))
+        none = np.flatnonzero(np.isnan(self.given(u)))
         if not none.size:
             return u_max
         low, high = u[max(none[0] - 1, 0)], u[none[0]]
         while low < (middle := 0.5 * (low + high)) < high:
-            low, high = (low, middle) if np.isnan(self._given(np.array([middle]))[0]) else (middle, high)
+            low, high = (low, middle) if np.isnan(self.given(np.array([middle]))[0]) else (middle, high)
         return float(low)
 
     def curve(self, u_max: float) -> FloatArray:

@@ -83,7 +83,8 @@ CELL_ROWS = 3
 XI, REST, STRESS, LOAD, LOSS, OMEGA, N_OTHERS = 0, 1, 2, 3, 4, 5, 6
 """X of Eq. 4 at 1 V, A0 at 0 V (m^2), stress at 1 V (Pa), load (N), c2 mu^2; the source's angular frequency (rad/s).
 After them come the amplitudes (V) of the sine and of the cosine in each of its tones; a square's or recording's is the
-first of both."""
+first of both. Under another contact law than the paper's the powers of 1/A over X follow, the highest first, and X is
+LARGEST_X where they end."""
 LARGEST_X = 1.3
 """Largest X that the series of the universal curve covers."""
 Scenes = tuple[
@@ -138,13 +139,23 @@ def _divide(
 
 @jit_rows
 def _inverse_areas(
-    at: float, top: FloatArray, b: FloatArray, series: FloatArray, y: FloatArray, out: FloatArray, marks: Marks
+    at: float, top: FloatArray, b: FloatArray, own: FloatArray, series: FloatArray, y: FloatArray, out: FloatArray,
+    marks: Marks,
 ) -> None:  # fmt: skip
     """1/A at the voltages top (1 + at) / 2 of every lane, by the universal curve and the closed form of Eqs. 1 and 3.
 
-    `b` holds the table's further rows (X, A0, stress, ...) for the lanes of the block; `y` (lanes,) is scratch.
+    `b` holds the table's further rows (X, A0, stress, ...) for the lanes of the block, `own` the powers of another law;
+    `y` (lanes,) is scratch.
     """
     lanes, half = len(marks[5]), 0.5 * (1.0 + at)
+    if own.size > 0:
+        for i in range(lanes):
+            out[i] = 0.0
+        for d in range(own.size // lanes):
+            for i in range(lanes):
+                x = b[XI * lanes + i] * (half * top[i]) * (2.0 / LARGEST_X) - 1.0
+                out[i] = out[i] * x + own[d * lanes + i]
+        return
     for i in range(lanes):
         y[i] = series[0]
     for d in range(1, series.size):
@@ -311,8 +322,9 @@ def fill_block(
             t[row * lanes + i] = table[row, scene]
     _divide(t, gap, source[1], source[2], k, moved, r, top, marks)
     b = t[CELL_ROWS * (m_all + 1) * lanes :]
+    own = b[(N_OTHERS + 2 * ((w_all + 1) // 2)) * lanes :]
     for j in range(d_all + 1):
-        _inverse_areas(curves[1][j], top, b, curves[0], near, values[j * lanes : (j + 1) * lanes], marks)
+        _inverse_areas(curves[1][j], top, b, own, curves[0], near, values[j * lanes : (j + 1) * lanes], marks)
     _polynomials(curves[2], values, top, b[XI * lanes :], area, c, tails, marks)
     at_rest = c[(area + d_all) * lanes : (area + d_all + 1) * lanes]
     _in_closed_form(k, moved, r, at_rest, rates, near, gain, feed, shape, marks)

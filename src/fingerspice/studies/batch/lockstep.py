@@ -14,7 +14,8 @@ from numpy.polynomial import chebyshev as powers
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import Value
-from fingerspice.circuit.statespace import Stack, build_stack, loop_of
+from fingerspice.circuit.laws import ContactLaw
+from fingerspice.circuit.statespace import Stack, build_stack, in_si, loop_of
 from fingerspice.engine.lockstep.card import march_on_card
 from fingerspice.engine.lockstep.march import N_PORTION, march
 from fingerspice.engine.lockstep.scenes import CELL_ROWS, LARGEST_X, LOAD, LOSS, OMEGA, REST, STRESS, new_block
@@ -45,6 +46,9 @@ _MOST_LAYERS, _MOST_TONES = 4, 4
 _MOST_PERIODS = 2000
 # Numbers of points tried for the universal curve's Chebyshev series, and the relative error allowed.
 _CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
+# Degree of the powers of another contact law, their relative error, and the gap voltages that they may reach, over the
+# source's peak.
+_OF_LAW, _LAW_ERROR, _REACHES = 24, 1e-11, (2.0, 1.2, 0.9, 0.6, 0.3)
 # Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
 _LEAST_RTOL_OF_SLOPES = 5e-7
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
@@ -111,8 +115,6 @@ def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str
     stack, tran = build_stack(circuit), circuit.tran
     if stack.contact is None or stack.gap is None or stack.gap_layer is None or stack.area_given is not None:
         return "the stack has no contact whose area follows the gap"
-    if stack.layers[stack.gap_layer].law is not None:
-        return "the contact law is not the paper's"
     if not 2 <= len(stack.layers) <= _MOST_LAYERS:
         return f"the stack has not 2 to {_MOST_LAYERS} layers"
     if (circuit.charge_law or "local") != "local" or circuit.work != "gap":
@@ -202,19 +204,25 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
     first = form.sources[0][0]
     period = first.waveform.period if first.waveform is not None else None
     frequency = form.frequency or values(first).get("frequency", 1.0 / (period or math.nan))
-    # As `Contact.packed`, for arrays of values: X at 1 V, A0, stress at 1 V, load, c2 mu^2
-    v = values(form.gap)
-    m, n, f_n, per_volt = v["m_exp"], v["n_exp"], np.asarray(v["fn"]), EPS0 * v["eps_r"] / v["d"]
-    alpha, beta = np.asarray(v["alpha"]) * 1e-6, np.asarray(v["beta"]) * 1e-6 * 1e3**n
-    area, p = alpha * f_n**m, 0.5 * (1.0 + 1.0 / m - 1.0 / n)
-    xi = np.sqrt(per_volt * (n * n / (n - m)) * beta ** (1.0 / n) * alpha ** (-1.0 / m)) * area**p / f_n
-    rows = [xi, area, 0.5 * per_volt / v["d"], f_n, v["c2"] * 1e-12 * np.asarray(v["mu"]) ** 2]
-    rows.append(2.0 * np.pi * np.asarray(frequency))
+    v, count, rows = in_si(form.gap, values(form.gap)), next(iter(scenes.values())).size, list[Any]()
     for element, sign in form.sources:
         recorded = None if form.recording is None else [(0.0, peak_of(form.recording), 0.0)]
         for _, amplitude, phase in recorded or _tones_of(element.waveform, values(element))[0]:
             rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
-    count, others, cell = next(iter(scenes.values())).size, CELL_ROWS * form.stack.c.size, 0
+    if form.gap.law is None:
+        # As `JkrContact.packed`, for arrays of values: X at 1 V, A0, c2 mu^2
+        m, n, f_n, per_volt = v["m_exp"], v["n_exp"], np.asarray(v["fn"]), EPS0 * v["eps_r"] / v["d"]
+        area, p = v["alpha"] * f_n**m, 0.5 * (1.0 + 1.0 / m - 1.0 / n)
+        xi = np.sqrt(per_volt * (n * n / (n - m)) * v["beta"] ** (1.0 / n) * v["alpha"] ** (-1.0 / m)) * area**p / f_n
+        loss = v["c2"] * np.asarray(v["mu"]) ** 2
+    else:
+        peak = sum(np.hypot(along, across) for along, across in zip(rows[::2], rows[1::2], strict=True))
+        xi, of_law = _series_of(form.gap.law, v, np.broadcast_to(peak, count))
+        # At 0 V the variable is -1.
+        area, loss, rows = 1.0 / np.polyval(of_law, -1.0), 0.0, [*rows, *of_law]
+    stress = 0.5 * EPS0 * v["eps_r"] / v["d"] ** 2
+    rows[:0] = [xi, area, stress, v["fn"], loss, 2.0 * np.pi * np.asarray(frequency)]
+    others, cell = CELL_ROWS * form.stack.c.size, 0
     out = np.empty((others + len(rows), count))
     for i, row in enumerate(rows, others):
         out[i] = row
@@ -225,6 +233,28 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
         of_cells[:, cell : cell + own] = np.moveaxis(cells.reshape(own, CELL_ROWS, -1), 0, 1)
         cell += own
     return out
+
+
+def _series_of(law: ContactLaw, v: dict[str, Any], peak: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """X at 1 V of scenes, and the powers of 1/A (n_power, n), the highest first; without any, X is beyond all series.
+
+    They reach to the largest of some multiples of the source's peak (V) up to which there are areas.
+    """
+    at, to_powers = _to_powers(_OF_LAW)
+    xi, found = np.full(peak.size, 1e30), np.zeros((at.size, peak.size))
+    found[-1] = 1.0
+    for multiple in _REACHES:
+        missing = np.flatnonzero((xi == 1e30) & (peak > 0.0))
+        given = {name: np.broadcast_to(x, peak.size)[missing] for name, x in v.items()}
+        top = multiple * peak[missing]
+        u = 0.5 * np.outer(at + 1.0, top)
+        inverse = 1.0 / law.contact({name: np.tile(x, at.size) for name, x in given.items()}).given(u.ravel())
+        series = chebyshev.coefficients(inverse.reshape(u.shape))
+        # NaN, where an area is missing, is not small.
+        good = np.abs(series[-2:]).max(axis=0) <= _LAW_ERROR * np.abs(series).max(axis=0)
+        xi[missing[good]] = LARGEST_X / top[good]
+        found[:, missing[good]] = to_powers @ inverse.reshape(u.shape)[:, good]
+    return xi, found
 
 
 def peak_of(recording: Samples) -> float:
@@ -239,12 +269,17 @@ def curves_of(m: float, n: float, degree: int) -> tuple[FloatArray, FloatArray, 
     series = chebyshev.fit(lambda x: universal_curve_array(x, 1.0 / m, p), 0.0, LARGEST_X, _CURVE_ERROR, _CURVE_SIZES)
     if series is None:
         return None
+    return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), *_to_powers(degree)
+
+
+@lru_cache(maxsize=32)
+def _to_powers(degree: int) -> tuple[FloatArray, FloatArray]:
+    """Chebyshev nodes, and the matrix from values there to the powers of their polynomial, the highest first."""
     to_powers = np.zeros((degree + 1, degree + 1))
     for k, one in enumerate(np.eye(degree + 1)):
         to_powers[: k + 1, k] = powers.cheb2poly(one[: k + 1])
     highest_first = (to_powers @ chebyshev.coefficients(np.eye(degree + 1)))[::-1]
-    at = chebyshev.nodes(degree + 1, -1.0, 1.0)
-    return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), at, np.ascontiguousarray(highest_first)
+    return chebyshev.nodes(degree + 1, -1.0, 1.0), np.ascontiguousarray(highest_first)
 
 
 class Run(NamedTuple):
@@ -373,7 +408,8 @@ class Ladder:
     def _run(self, pending: IntArray, covered: float, steps: int, degree: int, before: Run | None) -> Run | None:
         """Integrate scenes, for half the steps, too, where `before` has no results; None: no curve."""
         task, form, halves, columns = self.task, self.form, self.halves, self._columns(pending)
-        curves = curves_of(form.gap.values["m_exp"], form.gap.values["n_exp"], degree)
+        own = form.gap.values
+        curves = (np.zeros(0), *_to_powers(degree)) if form.gap.law else curves_of(own["m_exp"], own["n_exp"], degree)
         if curves is None:
             return None
         sizes, recorded = (steps // 2 if before is None else 0, steps), form.recording is not None
