@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import evidence as rows
 import numpy as np
 
 import fingerspice as fs
@@ -213,6 +214,41 @@ def periods() -> Any:
         right.loglog(counts, calls, f"{mark}-", color=color, markersize=4, label=label)
     right.set_xticks(counts, [str(n) for n in counts])
     right.minorticks_off()
+    legend_above(right)
+    return figure
+
+
+@picture
+def evidence() -> Any:
+    """Attraction against frequency for other gaps, and the voltages at which sine and square are felt."""
+    figure, (left, right) = new_figure(1, 2, height=3.3)
+    f = np.geomspace(10.0, 1e5, 81)
+    dress(left, "Mean attraction at 140 V [mN]", "Frequency [Hz]")
+    for circuit, style, color, label in (
+        (finger(), "-", BLUE, "Table 1, R_a of 1 MΩ"),
+        (finger().replace({"Xgap.r": 0.5e6}), "--", SKY, "0.5 MΩ"),
+        (finger().replace({"Xgap.r": 7e6}), "-.", VERMILION, "7 MΩ"),
+        (rows.ladder(), ":", BLACK, "constant-phase ladder"),
+    ):
+        force = fs.phasor(circuit.replace({"Vdrive.amplitude": 140.0}), f).f_el_mean
+        left.semilogx(f, 1e3 * force, style, color=color, label=label)
+    left.set_ylim(0.0, None)
+    left.axvspan(30.0, 230.0, color=GREY, alpha=0.15, linewidth=0)
+    left.text(83.0, 4.0, "30 to 230 Hz:\nsmall effect measured", ha="center", fontsize=7)
+    legend_above(left, 2)
+    dress(right, "Threshold voltage [V]", "Frequency [Hz]")
+    waves = (fs.Sine, "o-", BLUE, "sine"), (fs.Square, "s--", VERMILION, "square wave")
+    tried = [15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 120.0, 140.0, 160.0, 180.0, 200.0]
+    for wave, style, color, label in waves:
+        volts = [rows.threshold(wave, x) for x in tried]
+        right.loglog(tried, volts, style, color=color, markersize=3.5, label=label)
+    right.axvline(60.0, color=GREY, linestyle=":")
+    right.text(62.0, 75.0, "60 Hz, measured crossing\n(Vardar 2017)", fontsize=7)
+    ticks = [15, 30, 60, 120, 240]
+    right.set_xticks(ticks, [str(x) for x in ticks])
+    right.set_yticks([15, 20, 30, 50, 100], ["15", "20", "30", "50", "100"])
+    right.minorticks_off()
+    right.set_xlim(14.0, 250.0)
     legend_above(right)
     return figure
 
