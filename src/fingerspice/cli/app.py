@@ -89,6 +89,7 @@ def run(
       fingerspice run circuits/fingerpad.cir --finger moist --coating 3M-insulating --drive Fig4-5kHz
       fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,f_t
     """
+    from fingerspice.circuit.describe import area_given
     from fingerspice.solve.simulation import check_arguments, simulate
 
     if schematic:  # Only then: it loads matplotlib, which takes as long as a run.
@@ -96,8 +97,9 @@ def run(
     circuit, start = with_times(job.read(), job.stop, start)
     if circuit.tran is None:
         raise InputError(f"{job.deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
-    how: dict[str, Any] = {"start": start, "rtol": job.rtol, "method": method, "area": area_from_text(area)}
+    how: dict[str, Any] = {"start": start, "rtol": job.rtol, "method": method}
     check_arguments(job.rtol, method, start, jumps)
+    how["area"] = area_given(area_from_text(area))
     how |= {"charge_law": job.charge_law, "t_stop": None if job.stop is None else circuit.tran.stop}
     if stream or chunk or signals or netcdf:
         from fingerspice.cli.store import run_streamed

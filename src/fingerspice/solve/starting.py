@@ -28,7 +28,7 @@ from fingerspice.base.arrays import FloatArray, read_only
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
-from fingerspice.circuit.statespace import spanning_tree
+from fingerspice.circuit.statespace import Stack, spanning_tree
 from fingerspice.engine.implicit import N_COUNTERS, Nodal, new_work, pass_jump
 from fingerspice.engine.network import Net, new_room, ramp
 from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
@@ -124,8 +124,11 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
     """Cell voltages (V), areas (m^2) and sources at the DC operating point (at 0-), the nodes in `initial` held."""
     net, stack = scene.net, scene.network.stack
     s = sources = np.array([float(w.value(0.0, "left")) for w in scene.network.waveforms])
+    if stack is not None and scene.model is not None and not initial:
+        order = list(stack.state_order)
+        return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.net.area0, s
     network, added = scene.network, held_sources(circuit, initial) if initial else ()
-    if added:
+    if stack is not None or added:
         # The reduced network of a series loop has no nodes to be held.
         network = build_network(replace(circuit, work="gap"), added)
         sources = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
@@ -133,12 +136,10 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
     held = np.array([a.node in initial for a in network.areas], bool) & follows
     area[held] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, held, strict=True) if mark]
     _refuse_floating_at_dc(network, area)
-    if not (initial or s.any()):
-        return np.zeros(len(network.cells)), area, s
     part, before = 1.0, math.inf
     for _ in range(500):
         k, b = network.stiffness(network.leak(area))
-        x = np.linalg.solve(k, -b @ sources)
+        x = np.linalg.solve(k, -b @ sources) if k.size else np.zeros(0)
         u, new = network.p @ x + network.q @ sources, area.copy()
         for i in np.flatnonzero(follows & ~held).tolist():
             new[i] = 1.0 / inverse_area(abs(float(u[network.gaps[i]])), net.curves[i])[0]
@@ -151,7 +152,7 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
         area, before = area + part * (new - area), off
     else:
         raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
-    if stack is not None and added:
+    if stack is not None:
         of: dict[str, list[float]] = {}
         for layer, count in zip(stack.layers, stack.cells, strict=True):
             each = [v for cell, v in zip(network.cells, u.tolist(), strict=True) if cell.element is layer]
@@ -199,6 +200,30 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
         if not abs(found - u_gap) <= 1e-9 * abs(u_gap) + 1e-13 * float(np.abs(u).max()):
             raise InputError(f"the start has {u[scene.measured[0]]:.4g} V across the gap, {PAST_FOLD}")
     return state
+
+
+def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
+    """Cell voltages (V) along the loop (n_cell,) at the DC operating point; refused where some node has none."""
+    insulating = stack.layers_of(stack.g_total + stack.g_area == 0.0)
+    if len(insulating) > 1:
+        raise InputError(
+            f"no DC operating point: {' and '.join(insulating)} do not leak, so the nodes between them are reached "
+            "by capacitors only; allowed: a leakage (r=...), or uic in .tran to start uncharged"
+        )
+
+    def split(area: float) -> FloatArray:
+        g = stack.g_total + stack.g_area * area
+        # A layer that does not leak takes all of the voltage.
+        r = (g == 0.0) + 0.0 if insulating else 1.0 / g
+        return np.asarray(u_source * r / r.sum())
+
+    if stack.gap is None or not model.coupled:
+        return split(model.area0)
+    low, high = 0.0, abs(u_source)
+    while low < (middle := 0.5 * (low + high)) < high:
+        more = abs(split(1.0 / inverse_area(middle, model.curve)[0])[stack.gap]) > middle
+        low, high = (middle, high) if more else (low, middle)
+    return split(1.0 / inverse_area(high, model.curve)[0])
 
 
 # Residual of Kirchhoff's law that rounded decimals of a deck may cause, relative to the largest start voltage; and
