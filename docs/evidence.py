@@ -82,21 +82,10 @@ def percent(x: float) -> float:
     return 100.0 * (x - 1.0)
 
 
-def ladder(n: float = 0.2, size: float = 1e6, at: float = 100.0) -> fs.Circuit:
-    """Table 1 with the constant-phase element Q s^n in the place of R_a: `size` (ohm) at the frequency `at` (Hz).
-
-    As s^n = (sin(n pi)/pi) int_0^inf x^(n-1) s/(s+x) dx, it is 13 branches of R and C, two a decade from 1 Hz to 1 MHz,
-    with a resistor and a capacitor for the ends of the integral: exact to 0.5 % from 10 Hz to 100 kHz.
-    """
-    ratio = math.sqrt(10.0)
-    nodes = [2.0 * math.pi * ratio**k for k in range(13)]
-    low, high = nodes[0] / math.sqrt(ratio), nodes[-1] * math.sqrt(ratio)
-    q = math.sin(n * math.pi) / math.pi / (size * (2.0 * math.pi * at) ** n)
-    lines = [f"Rlow top skin {n / (q * low**n)!r}", f"Chigh top skin {q * high ** (n - 1.0) / (1.0 - n)!r}"]
-    for k, x in enumerate(nodes):
-        weight = q * math.log(ratio) * x**n
-        lines += [f"R{k} top m{k} {1.0 / weight!r}", f"C{k} m{k} skin {weight / x!r}"]
-    return fs.parse_netlist(DECK.replace(".tran", "\n".join([*lines, ".tran"]))).replace({"Xgap.r": math.inf})
+def constant_phase(n: float = 0.2, size: float = 1e6, at: float = 100.0) -> fs.Circuit:
+    """Table 1 with a constant-phase element in the place of R_a: `size` (ohm) at the frequency `at` (Hz)."""
+    element = f"Xphase top skin CPE q={1.0 / (size * (2.0 * math.pi * at) ** n)!r} n_cpe={n!r}"
+    return fs.parse_netlist(DECK.replace(".tran", f"{element}\n.tran")).replace({"Xgap.r": math.inf})
 
 
 @cache
@@ -212,18 +201,19 @@ ROWS = [
                  percent(sine(150.0, 230.0).area_mean / sine(150.0, 30.0).area_mean)]),
     Row(FTIR, "attraction from 30 to 230 Hz", "small effect of the frequency",
         "at 150 V {:+.0f} % ({:+.0f} % in the coupled run); R_a of 2, 3, 7 MΩ {:+.0f}, {:+.0f}, {:+.0f} %; for R_a a "
-        "ladder of R and C with constant phase (n = 0.2) {:+.0f} %", "off: {0:+.0f} %",
-        "a higher R_a, or the ladder in a network; a constant-phase element of its own is not in the package",
+        "constant-phase element (n = 0.2) {:+.0f} %", "off: {0:+.0f} %",
+        "a higher R_a, or `CPE` beside the gap",
         [(44, 46), (43.5, 45), (22, 23.5), (13, 15), (3, 4), (4, 6)],
         lambda: [percent(rise(30.0, 230.0, 150.0)), percent(sine(150.0, 230.0).f_el_mean / sine(150.0, 30.0).f_el_mean),
                  *(percent(rise(30.0, 230.0, 150.0, Xgap_r=r)) for r in (2e6, 3e6, 7e6)),
-                 percent(rise(30.0, 230.0, 150.0, ladder()))]),
+                 percent(rise(30.0, 230.0, 150.0, constant_phase()))]),
     Row("Meyer 2013, the points in Fig. 3 of the paper", "attraction at 10 kHz over that at 100 Hz",
         "up to 1.8; wide scatter, some fingers do not level off",
-        "{:.2f}; R_a of 0.5, 2, 7 MΩ {:.2f}, {:.2f}, {:.2f}; the ladder of row 5 {:.2f}", "agrees",
-        "within the scatter; 7 MΩ mends row 5 and gives no rise here, the ladder does both",
+        "{:.2f}; R_a of 0.5, 2, 7 MΩ {:.2f}, {:.2f}, {:.2f}; the element of row 5 {:.2f}", "agrees",
+        "within the scatter; 7 MΩ mends row 5 and gives no rise here, the element does both",
         [(1.705, 1.74), (3, 3.1), (1.19, 1.23), (0.89, 0.93), (1.7, 1.78)],
-        lambda: [*(rise(100.0, 1e4, Xgap_r=r) for r in (1e6, 0.5e6, 2e6, 7e6)), rise(100.0, 1e4, 140.0, ladder())]),
+        lambda: [*(rise(100.0, 1e4, Xgap_r=r) for r in (1e6, 0.5e6, 2e6, 7e6)),
+                 rise(100.0, 1e4, 140.0, constant_phase())]),
     Row("Sirin 2021, Liu 2018", "apparent contact area in full slip under voltage", "significantly smaller",
         "{:+.1f} % (mean at 200 V, 100 Hz), {:+.1f} % at 200 V across the gap; but {:+.1f} % at 75 V", "agrees in sign",
         "only at high voltages; `c2` from measured areas by `fit_contact`", [(-1.1, -0.7), (-12.7, -12.3), (0.5, 0.8)],

@@ -228,7 +228,7 @@ def evidence() -> Any:
         (finger(), "-", BLUE, "Table 1, R_a of 1 MΩ"),
         (finger().replace({"Xgap.r": 0.5e6}), "--", SKY, "0.5 MΩ"),
         (finger().replace({"Xgap.r": 7e6}), "-.", VERMILION, "7 MΩ"),
-        (rows.ladder(), ":", BLACK, "constant-phase ladder"),
+        (rows.constant_phase(), ":", BLACK, "constant-phase element"),
     ):
         force = fs.phasor(circuit.replace({"Vdrive.amplitude": 140.0}), f).f_el_mean
         left.semilogx(f, 1e3 * force, style, color=color, label=label)

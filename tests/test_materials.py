@@ -11,7 +11,8 @@ from scipy.optimize import nnls
 import fingerspice as fs
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.studies.fit.materialfit import read_table
-from scenes import cases, listed
+from ngspice_tools import run_ngspice
+from scenes import cases, deck, finger, listed
 
 CUBIC, PRINTED, QUARTIC = (3, 2, 1), (3, 3, 2), (4, 3, 2)
 F = np.logspace(1.0, 5.0, 81)
@@ -189,3 +190,20 @@ def test_a_fit_draws_itself_and_gives_the_lines_for_a_deck(tmp_path: Path) -> No
     (tmp_path / "deck.cir").write_text("\n".join([lines[0], ".include myskin.lib", *lines[1:]]))
     circuit = fs.read_netlist(tmp_path / "deck.cir")
     assert len(circuit.by_device("SLAB")) == len(fit.ladder.poles) + 1
+
+
+@pytest.mark.parametrize("n", [1e-6, 0.2, 0.5, 0.8, 0.999])
+def test_a_constant_phase_element_has_its_admittance(n: float) -> None:
+    circuit = deck("V1 a 0 SIN(0 10 100) AC 1", f"Xq a b CPE q=3e-8 n_cpe={n!r}", "R1 b 0 1", ".tran 20u 20m uic")
+    f = np.geomspace(10.0, 1e5, 81)
+    found = 1.0 / (fs.phasor(circuit, f).impedance - 1.0)
+    np.testing.assert_allclose(found, 3e-8 * (2j * np.pi * f) ** n, rtol=5e-3)
+
+
+def test_a_constant_phase_element_is_the_same_in_ngspice() -> None:
+    lines = ["Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, r="inf")]
+    text = "\n".join(["beside the gap", ".include fingerspice.lib", *lines, "Xq top skin CPE q=0.28u n_cpe=0.2",
+                      ".tran 4u 20m 0 4u uic", ""])  # fmt: skip
+    run = run_ngspice(text)
+    ours = fs.simulate(fs.parse_netlist(text), t_eval=np.clip(run["time"], 0.0, 0.02), rtol=1e-6)
+    assert np.abs(run["v(top)-v(skin)"] - ours.u_gap).max() <= 3e-4 * np.abs(ours.u_gap).max()

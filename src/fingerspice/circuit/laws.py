@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,8 +14,10 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import FloatArray, Remembering, real_number, real_numbers
 from fingerspice.circuit.devices import DEVICES, OF_EVERY_LAW, DeviceSpec, ParameterSpec
 from fingerspice.physics import laws
-from fingerspice.physics.contact import LawContact
 from fingerspice.waveforms.waveform import refuse, require
+
+if TYPE_CHECKING:
+    from fingerspice.physics.contact import LawContact
 
 #: Name of the paper's law, which a GAP has by default; and every other law by its name.
 PAPER, LAWS = "jkr", dict[str, "ContactLaw"]()
@@ -98,6 +100,8 @@ class ContactLaw(Remembering):
 
     def contact(self, v: Mapping[str, Any]) -> LawContact:
         """The contact of a GAP with this law and these values, SI; arrays (n,) stand for one at each gap voltage."""
+        from fingerspice.physics.contact import LawContact
+
         own = {name: v[name] for name in ("d", "eps_r", "fn", "mu", *self.parameters)}
         return LawContact(v["d"], v["eps_r"], v["fn"], v["mu"], self.name, self.area, own)
 

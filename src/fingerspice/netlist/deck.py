@@ -151,7 +151,7 @@ class _Instance:
         refuse(device.kind != "word", f"{device.written} stands where a device's name belongs", device)
         native, key = device.text.upper(), device.text.lower()
         around = tuple(dropwhile(lambda one: key not in one.definition.inner, (self, *self.around)))
-        called = around[0].definition.inner[key] if around else None
+        called = around[0].definition.inner[key] if around else self.deck.shipped_definition(key)
         if called is None and native not in layer_devices():
             raise InputError(_unknown_device(plain, self), device.where)
         shown, wanted = (called.name, called.ports) if called else (native, DEVICES[native].nodes)

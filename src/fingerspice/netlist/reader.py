@@ -30,6 +30,7 @@ from fingerspice.waveforms.waveform import refuse
 
 #: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
+SHIPPED = ("cpe",)  #: Their subcircuits that are no device here: they are read from there wherever a deck calls them.
 
 MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30  #: Of a file, and of all the files that a deck's sources name.
 
@@ -272,6 +273,17 @@ class Deck:
         if self._control is not None:
             raise InputError(".control without its .endc", self._control.where())
         refuse(len(self._open) > 1, f".subckt {self._open[-1].name} without its .ends", self._open[-1])
+
+    def shipped_definition(self, name: str) -> Subcircuit | None:
+        """A subcircuit of the shipped library that is no device of its own, by its name in lower case."""
+        if name not in SHIPPED:
+            return None
+        if name not in self.root.inner:
+            _, begin, rest = shipped_text("local").partition(f".subckt {name.upper()} ")
+            body, end, _ = rest.partition(".ends\n")
+            for line in logical_lines(lexer.split_lines(begin + body + end), LIBRARIES["local"]):
+                self._take(line)
+        return self.root.inner[name]
 
     def warn(self, message: str, where: Where) -> None:
         """Keep a warning with its place, unless there are many already."""

@@ -323,6 +323,9 @@ def fill_block(
     _divide(t, gap, source[1], source[2], k, moved, r, top, marks)
     b = t[CELL_ROWS * (m_all + 1) * lanes :]
     own = b[(N_OTHERS + 2 * ((w_all + 1) // 2)) * lanes :]
+    for i in range(lanes if own.size > 0 else 0):
+        # A law's areas may end before the voltage that the gap might reach.
+        top[i] = min(top[i], (1.0 - 1e-12) * LARGEST_X / b[XI * lanes + i])
     for j in range(d_all + 1):
         _inverse_areas(curves[1][j], top, b, own, curves[0], near, values[j * lanes : (j + 1) * lanes], marks)
     _polynomials(curves[2], values, top, b[XI * lanes :], area, c, tails, marks)

@@ -48,7 +48,7 @@ _MOST_PERIODS = 2000
 _CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
 # Degree of the powers of another contact law, their relative error, and the gap voltages that they may reach, over the
 # source's peak.
-_OF_LAW, _LAW_ERROR, _REACHES = 24, 1e-11, (2.0, 1.2, 0.9, 0.6, 0.3)
+_OF_LAW, _LAW_ERROR, _REACHES = 24, 1e-11, (2.0, 1.5, 1.2, 1.1, 1.0, 0.9, 0.8, 0.7, 0.6, 0.4)
 # Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
 _LEAST_RTOL_OF_SLOPES = 5e-7
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
