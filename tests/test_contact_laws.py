@@ -12,8 +12,9 @@ from scipy.integrate import solve_ivp
 
 import analytic as ref
 import fingerspice as fs
+from fingerspice.explorer.scene import as_deck, scene
 from ngspice_tools import run_ngspice
-from scenes import deck, finger, table1
+from scenes import deck, finger, table1, table1_deck
 
 Areas = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 P = ref.TABLE1
@@ -34,6 +35,7 @@ def own_areas(u: Any) -> Any:
 
 LAW = fs.ContactLaw("pulled", pulled, {"k": 70e-6})
 OWN = {"Xgap.law": LAW, "Xgap.k": 60e-6}
+PAPERS = ("alpha", "m_exp", "beta", "n_exp", "c2")
 
 
 def dmt(u: float) -> float:
@@ -88,7 +90,7 @@ def test_a_law_of_ones_own_runs_a_stack(method: str) -> None:
 
 @pytest.mark.parametrize(("law", "areas"), [("dmt", dmt), ("linear", linear)])
 def test_the_laws_of_the_package_have_the_roots_of_their_equations(law: str, areas: Callable[[float], float]) -> None:
-    circuit = table1(gap={"law": law, "alpha": None, "m_exp": None, "beta": None, "n_exp": None, "c2": None})
+    circuit = table1(gap={"law": law, **dict.fromkeys(PAPERS)})
     solution = fs.simulate(circuit, t_eval=TIMES, rtol=1e-8)
     expected = np.array([areas(abs(u)) for u in solution.u_gap.tolist()])
     np.testing.assert_allclose(solution.area, expected, rtol=1e-11)
@@ -174,6 +176,16 @@ def test_the_papers_law_by_name_changes_nothing() -> None:
 
 
 SHORT = fs.ContactLaw.from_table("short", [0.0, 20.0, 50.0], [35e-6, 36e-6, 37e-6])
+
+
+def test_a_law_has_sliders_and_a_deck_of_the_page() -> None:
+    deck_text = table1_deck(gap={"law": "linear", "slope": 60.0, **dict.fromkeys(PAPERS)})
+    given = {"deck": deck_text, "overrides": {"Xgap.slope": 70.0}}
+    gap = next(one for one in scene(given)["sliders"] if one["element"] == "Xgap")
+    found = {one["path"]: (one["low"], one["value"], one["high"]) for one in gap["sliders"]}
+    assert found["Xgap.slope"] == (0.0, 70.0, 300.0)
+    assert "Xgap.alpha" not in found
+    assert "contact law linear" in as_deck(given)
 
 
 @pytest.mark.parametrize(

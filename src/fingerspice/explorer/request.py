@@ -70,7 +70,8 @@ def value_text(value: float, unit: str) -> str:
 
 def _of_parameter(spec: ParameterSpec, value: float) -> tuple[float, float, bool]:
     """Ends of a device parameter's slider, and whether it is logarithmic."""
-    assert spec.usual is not None
+    if spec.usual is None:  # Of a contact law
+        return min(0.0, 5.0 * value), max(0.0, 5.0 * value) or 1.0, False
     least, most = spec.usual.least, spec.usual.most
     if not math.isfinite(value):
         return least, most, True
