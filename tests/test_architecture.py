@@ -18,7 +18,7 @@ PACKAGE = ROOT / "src" / "fingerspice"
 FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
-# lowered; what moves from one package to another takes its lines along. Contact laws and CPE raised them, once, by 469.
+# lowered; what moves from one package to another takes its lines along. Contact laws and CPE raised them, once, by 470.
 ALL_LINES = 34_785
 ALL_FILES = 129
 PACKAGE_LINES = {
