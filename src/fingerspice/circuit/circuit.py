@@ -18,7 +18,16 @@ from fingerspice.base.arrays import Remembering, real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.pages import Page, Shown
 from fingerspice.base.units import parse_number
-from fingerspice.circuit.devices import DEVICES, DeviceSpec, check, concerns, mega_note, unit_trap, unusual_of_changed
+from fingerspice.circuit.devices import (
+    DEVICES,
+    OF_EVERY_LAW,
+    DeviceSpec,
+    check,
+    concerns,
+    mega_note,
+    unit_trap,
+    unusual_of_changed,
+)  # fmt: skip
 from fingerspice.circuit.laws import ContactLaw, law_of
 from fingerspice.waveforms.waveform import Waveform, as_waveform, refuse, require
 
@@ -277,6 +286,10 @@ class Circuit(Remembering, Shown):
                 elements[key] = dataclasses.replace(elements[key], waveform=waveform, ac=None)
             elif name in elements and parameter == "law" and elements[name].device == "GAP":
                 elements[name] = elements[name].under(law_of(value))
+                # What was changed of the law that is left is forgotten.
+                for old in [x for x in overrides if x.lower().rpartition(".")[0] == name]:
+                    if old.lower().rpartition(".")[2] not in OF_EVERY_LAW:
+                        del overrides[old]
             elif name in elements:
                 elements[name], trap = _changed(elements[name], parameter, value, path)
                 traps |= {key: trap} if trap else {}

@@ -24,7 +24,8 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import MEANINGS, shown, unusual_of_changed
 from fingerspice.circuit.network import network_of, with_skin_held
-from fingerspice.circuit.statespace import driving, driving_sources, shared
+from fingerspice.circuit.statespace import contact_of, driving, driving_sources, shared
+from fingerspice.physics.contact import LawContact
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.periodic import PWL, Burst, Repeat
@@ -51,7 +52,7 @@ def in_force(circuit: Circuit) -> dict[str, tuple[dict[str, Any], tuple[str, ...
     found = {}
     for name, values in circuit.sets.items():
         # The elements of a run read from a file may be unknown; its values are then those that the file names.
-        kept = {path: value for path, value in values.items() if now.get(path.lower(), value) == value}
+        kept = {path: x for path, x in values.items() if now.get(path.lower(), None if circuit.elements else x) == x}
         found[name] = kept, tuple(path for path in values if path not in kept)
     return found
 
@@ -62,7 +63,8 @@ def digests(circuit: Circuit) -> tuple[str, str]:
     for element in circuit.elements:
         wave = element.waveform
         elements.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
-        elements.update((element.law.name if element.law else "").encode())
+        if isinstance(contact := contact_of(element) if element.law else None, LawContact):
+            elements.update(f"{contact.law} {contact.digest}".encode())
         sources.update(repr((element.name, wave.digest() if isinstance(wave, Samples) else wave)).encode())
     elements.update(repr((dict(circuit.initial), tran and (tran.max_step, tran.uic))).encode())
     return elements.hexdigest(), sources.hexdigest()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,13 +54,18 @@ class ContactLaw(Remembering):
     parameters: Mapping[str, float | ParameterSpec] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        what, name = f"contact law {self.name}", str(self.name).lower()
+        require(isinstance(self.name, str), "the name of a contact law", repr(self.name), "a word")
+        what, name = f"contact law {self.name}", self.name.lower()
         allowed = f"a word but {', '.join(_OWN)}"
         require(name.isidentifier() and name not in _OWN, "contact law", repr(self.name), allowed)
         require(callable(self.area), f"the area of {what}", repr(self.area), "a function area(u, p)")
+        mapping = isinstance(self.parameters, Mapping) and all(isinstance(own, str) for own in self.parameters)
+        require(mapping, f"the parameters of {what}", repr(self.parameters), "a mapping such as {'k': 1.0}")
+        object.__setattr__(self, "parameters", dict(self.parameters))
         for own, default in self.parameters.items():
             if not isinstance(default, ParameterSpec):
-                real_number(f"{what}: {own}", default, "a number")
+                number = real_number(f"{what}: {own}", default, "a number")
+                require(math.isfinite(number), f"{what}: {own}", f"{number}", "a finite number")
             known = own.isidentifier() and own.islower() and own not in (*OF_EVERY_LAW, "law")
             require(known, f"a parameter of {what}", repr(own), f"a word in lower case but {', '.join(OF_EVERY_LAW)}")
         LAWS[name] = self
@@ -85,7 +91,7 @@ class ContactLaw(Remembering):
         refuse(u[0] != 0.0 or not np.all(np.diff(u) > 0.0), single)
         refuse(not np.all((areas > 0.0) & (areas < np.inf)), f"{what} has an area that is not above 0")
         table = PchipInterpolator(u, areas, extrapolate=False)
-        return cls(name, lambda u, p: np.asarray(table(u)))
+        return cls(name, partial(_of_table, table))
 
     @cached_property
     def spec(self) -> DeviceSpec:
@@ -106,6 +112,10 @@ class ContactLaw(Remembering):
         return LawContact(v["d"], v["eps_r"], v["fn"], v["mu"], self.name, self.area, own)
 
 
+def _of_table(table: Callable[[FloatArray], FloatArray], u: FloatArray, p: Mapping[str, float]) -> FloatArray:
+    return np.asarray(table(u))
+
+
 def law_of(given: object) -> ContactLaw | None:
     """A law, or that of a name; None for the paper's."""
     if isinstance(given, ContactLaw):
@@ -116,7 +126,9 @@ def law_of(given: object) -> ContactLaw | None:
 
 
 _OWN: tuple[str, ...] = ()
-ContactLaw("dmt", laws.dmt, {"alpha": 54.4, "m_exp": 0.52})
+# From m_exp = 1 on there is no area, or two.
+_BELOW_1 = dataclasses.replace(DEVICES["GAP"].parameter("m_exp"), most=0.999)
+ContactLaw("dmt", laws.dmt, {"alpha": 54.4, "m_exp": _BELOW_1})
 _SLOPE = ParameterSpec("slope", "mm^2/N", 72.5, meaning="area per load")
 ContactLaw("linear", laws.linear, {"slope": _SLOPE, "a_max": ParameterSpec("a_max", "mm^2", 100.0, meaning="largest")})
 _OWN = (PAPER, *LAWS)

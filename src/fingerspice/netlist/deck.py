@@ -17,7 +17,7 @@ from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.expressions import Bare, Call, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
-from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, OTHERS, Deck, Statement, Subcircuit
+from fingerspice.netlist.reader import DIRECTIVES, LIBRARIES, MAX_BYTES, OTHERS, SHIPPED, Deck, Statement, Subcircuit
 from fingerspice.netlist.sources import SOURCES
 from fingerspice.waveforms.waveform import refuse
 
@@ -187,7 +187,12 @@ class _Instance:
                 hint = nearest(parameter, allowed) or f"; it has {' '.join(allowed.values()) or 'none'}"
                 raise InputError(f"subcircuit '{called.name}' has no parameter '{word.text}'{hint}", word.where)
             inner.preset(parameter, scope.number(value))
-        _refuse_captured(called.name, inner.solve(), words, scope)
+        values = inner.solve()
+        shipped = key in SHIPPED and called.where.file == LIBRARIES["local"]
+        if shipped and not (values["q"] > 0.0 and 0.0 < values["n_cpe"] < 1.0):
+            said = f"q={values['q']:g} and n_cpe={values['n_cpe']:g}"
+            raise InputError(f"{name}: CPE has {said}; allowed: q above 0, and n_cpe between 0 and 1", device.where)
+        _refuse_captured(called.name, values, words, scope)
         _Instance(self.deck, called, inner, around, f"{name}.", ports, (*self.calls, called)).expand()
 
 

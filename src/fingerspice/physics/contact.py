@@ -26,8 +26,10 @@ from fingerspice.physics.materials import EPS0
 
 N_PACKED = 8
 """Length of the parameter vector that the compiled functions take."""
-# Terms that a curve may have, and its error, relative; errors and terms of a rough function's.
-_SIZES, _ERROR, _ROUGH = (32, 48), 2e-15, ((1e-12, (96, 192)), (1e-9, (384, 768)), (1e-6, (768,)))
+# Terms that a curve may have, and its error, relative to the largest 1/A. Of a rough function's: that error, the one of
+# any area at the places where it is checked, and terms.
+_SIZES, _ERROR, _CHECKED = (32, 48), 2e-15, 1025
+_ROUGH = ((1e-12, 1e-10, (96, 192)), (1e-9, 1e-8, (384, 768)), (1e-6, 3e-5, (768,)))
 # How far below 0 V the curve of an even function reaches, and where a curve ends before the end of the areas: both over
 # the largest voltage.
 _EVEN, _BEFORE_END = 0.3, (0.999, 0.99, 0.95)
@@ -71,6 +73,10 @@ class Contact:
     def stress(self, u_gap: ArrayLike) -> FloatArray:
         """Electroadhesive stress sigma_el (Eq. 2), Pa, at gap voltage `u_gap` (V)."""
         return np.asarray(0.5 * EPS0 * self.eps_r / self.d**2 * np.asarray(u_gap, float) ** 2)
+
+    def reach(self, u_max: float) -> float:
+        """The gap voltage (V) up to which there is an area, at most `u_max`."""
+        return u_max
 
     def curve(self, u_max: float) -> FloatArray:
         """1/A_R as one Chebyshev series over |u_gap| <= `u_max` (V), for `inverse_area`.
@@ -184,13 +190,17 @@ class LawContact(Contact):
     def given(self, u: FloatArray) -> FloatArray:
         """The function's areas at gap voltages of 0 V or more, (n,); NaN for those that are no positive number."""
         with np.errstate(all="ignore"):
-            area = real_numbers(
-                f"the area of the contact law {self.law}", self.function(u, self.values), "real numbers"
-            )
+            found = self.function(u.copy(), dict(self.values))
+        area = real_numbers(f"the area of the contact law {self.law}", found, "real numbers, shape (n,)")
         if area.shape != u.shape:
             said = f"the contact law {self.law} gives areas of shape {area.shape} at {u.size} gap voltages"
             raise InputError(f"{said}; allowed: one for each of the voltages (n,), in m^2")
         return np.where((area > 0.0) & (area < math.inf), area, math.nan)
+
+    @cached_property
+    def digest(self) -> str:
+        """What tells two laws of one name apart: their areas at some gap voltages, to nine digits."""
+        return " ".join(f"{x:.9g}" for x in self.given(np.linspace(0.0, 1000.0, 129)).tolist())
 
     def area(self, u_gap: ArrayLike) -> FloatArray:
         """Ridge contact area, m^2, at gap voltage `u_gap` (V).
@@ -203,12 +213,13 @@ class LawContact(Contact):
         u = np.abs(np.asarray(u_gap, float))
         area = self.given(u.ravel()).reshape(u.shape)
         if np.isnan(area).any():
-            raise InputError(self.ends(float(u[np.isnan(area)].min())))
+            said = f"the contact law {self.law} has no area above 0 at {u[np.isnan(area)].min():.4g} V across the gap"
+            raise InputError(f"{said}; allowed: a smaller source, or a law that reaches further")
         return area
 
-    def ends(self, u: float) -> str:
-        """The message about a gap voltage (V) at which there is no area."""
-        said = f"the contact law {self.law} has no area above 0 at {u:.4g} V across the gap"
+    def ends(self, known: float) -> str:
+        """The message about a gap voltage (V) that passes the largest one whose areas are known."""
+        said = f"the gap voltage passes {known:.4g} V, up to which areas of the contact law {self.law} are known"
         return f"{said}; allowed: a smaller source, or a law that reaches further"
 
     def reach(self, u_max: float) -> float:
@@ -228,23 +239,26 @@ class LawContact(Contact):
         Raises
         ------
         InputError
-            If these do not give 1e-6 of the area, and without an area at 0 V.
+            If these do not give 3e-5 of every area, and without an area at 0 V.
         """
         reach = self.reach(u_max)
         # Where the areas end, their slope may have none: the curve then ends a little before.
-        shares = _BEFORE_END if reach < u_max else (1.0,)
-        for error, sizes in ((_ERROR, _SIZES), *_ROUGH):
-            for share in shares:
-                hi = share * reach
+        shares, missed = _BEFORE_END if reach < u_max else (1.0,), math.inf
+        for share in shares:
+            hi = share * reach
+            between = np.linspace(0.0, hi, _CHECKED)
+            areas = self.area(between)
+            for error, allowed, sizes in ((_ERROR, 1e-11, _SIZES), *_ROUGH):
                 # An even function is its own continuation.
                 for lo in (-_EVEN * hi, 0.0):
                     series = chebyshev.fit(lambda u: 1.0 / self.area(u), lo, hi, error, sizes)
                     if series is not None:
-                        return _continued(lo, hi, series, self.packed)
-        said = (
-            f"the contact law {self.law} is too rough up to {reach:.4g} V: {sizes[-1]} terms miss it by over {error:g}"
-        )
-        raise InputError(f"{said}; allowed: areas without jumps")
+                        at = 2.0 * (between - lo) / (hi - lo) - 1.0
+                        missed = float(np.abs(np.polynomial.chebyshev.chebval(at, series) * areas - 1.0).max())
+                        if missed <= allowed:
+                            return _continued(lo, hi, series, self.packed)
+        said = f"the contact law {self.law} is too rough up to {reach:.4g} V: {_ROUGH[-1][-1][-1]} terms miss some area"
+        raise InputError(f"{said} by {min(missed, 1.0):.2g}; allowed: 3e-5, so areas without jumps and in usual units")
 
 
 def _continued(lo: float, hi: float, series: FloatArray, packed: FloatArray) -> FloatArray:

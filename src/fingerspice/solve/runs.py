@@ -319,13 +319,13 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     for finger, (name, contact) in enumerate(record.fingers):
         u_peak, f_peak, u_error, _ = run.gaps[finger].tolist()
         where, i = f" of {name}" if several else "", problem.network.fingers[finger]
+        if isinstance(contact, LawContact) and net.gap[i] >= 0 and u_peak > net.curves[i, 1]:
+            raise InputError(contact.ends(float(net.curves[i, 1])))
         unloaded = least = largest = float(net.area0[i])
         if net.slow[i] >= 0:
             area = record.each("area")[finger]
             least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
         elif net.gap[i] >= 0:
-            if isinstance(contact, LawContact) and u_peak > net.curves[i, 1]:
-                raise InputError(contact.ends(u_peak))
             least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
             largest = max(unloaded, least)
         if u_peak > BREAKDOWN_VOLTAGE:

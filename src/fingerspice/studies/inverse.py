@@ -96,9 +96,10 @@ class Finger:
         def mean(amplitude: FloatArray) -> FloatArray:
             return np.asarray(self.force(amplitude[:, None] * shape) @ weight)
 
-        top = 1.0
-        while top <= 1e6 and mean(np.array([top]))[0] < 1.01 * most:
+        top, end = 1.0, self.reach(1e6)
+        while top <= end and mean(np.array([min(top, end)]))[0] < 1.01 * most:
             top *= 1.4
+        top = min(top, end)
         amplitude = top * np.arange(1, _GRID + 1) / _GRID
         force = mean(amplitude)
         rising = np.append(np.diff(force) > 0.0, False)
@@ -119,6 +120,10 @@ class Finger:
             return u
 
         return voltages
+
+    def reach(self, u_max: float) -> float:
+        """The gap voltage (V) up to which there is an area, at most `u_max`."""
+        return u_max if self.area is not None else self.contact.reach(u_max)
 
     def inverter(self, u_max: float) -> Callable[[FloatArray, float, float, float], tuple[FloatArray, BoolArray]]:
         """What computes source voltages (V), and which a limit holds, for gap voltages of up to `u_max` (V).

@@ -174,7 +174,7 @@ def capability(
     mu = finger.contact.mu
     refuse(mu == 0.0, f"{finger.gap.name} has mu=0 and no friction; allowed: mu > 0")
     # The charges in the layers can raise the gap voltage above the source voltage, but not to ten times the limit.
-    most = 0.4 * float(finger.force(10.0 * limit))
+    most = 0.4 * float(finger.force(finger.reach(10.0 * limit)))
     search = _Search(finger, limit, carrier, most)
     force = np.linspace(0.0, search.largest(lambda x: search.wanted(x, 1.0 / _LASTS, 0.0), most), means)
     amplitude = np.zeros((means, f.size))

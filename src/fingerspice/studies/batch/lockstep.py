@@ -48,7 +48,7 @@ _MOST_PERIODS = 2000
 _CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
 # Degree of the powers of another contact law, their relative error, and the gap voltages that they may reach, over the
 # source's peak.
-_OF_LAW, _LAW_ERROR, _REACHES = 24, 1e-11, (2.0, 1.5, 1.2, 1.1, 1.0, 0.9, 0.8, 0.7, 0.6, 0.4)
+_OF_LAW, _LAW_ERROR, _REACHES = 24, 1e-10, (2.0, 1.5, 1.2, 1.1, 1.0, 0.9, 0.8, 0.7, 0.6, 0.4)
 # Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
 _LEAST_RTOL_OF_SLOPES = 5e-7
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
@@ -240,20 +240,29 @@ def _series_of(law: ContactLaw, v: dict[str, Any], peak: FloatArray) -> tuple[Fl
 
     They reach to the largest of some multiples of the source's peak (V) up to which there are areas.
     """
-    at, to_powers = _to_powers(_OF_LAW)
+    at, _, to_powers = _to_powers(_OF_LAW)
+    # The polynomials are checked between their nodes.
+    every = np.concatenate([at, 0.5 * (at[1:] + at[:-1])])
     xi, found = np.full(peak.size, 1e30), np.zeros((at.size, peak.size))
     found[-1] = 1.0
     for multiple in _REACHES:
         missing = np.flatnonzero((xi == 1e30) & (peak > 0.0))
-        given = {name: np.broadcast_to(x, peak.size)[missing] for name, x in v.items()}
+        # Parameters that are equal in all scenes stay numbers.
+        given = {k: np.tile(x[missing], every.size) if np.ndim(x) else x for k, x in v.items()}
         top = multiple * peak[missing]
-        u = 0.5 * np.outer(at + 1.0, top)
-        inverse = 1.0 / law.contact({name: np.tile(x, at.size) for name, x in given.items()}).given(u.ravel())
-        series = chebyshev.coefficients(inverse.reshape(u.shape))
+        u = 0.5 * np.outer(every + 1.0, top)
+        try:
+            inverse = (1.0 / law.contact(given).given(u.ravel())).reshape(u.shape)
+        except Exception:  # A function of a single scene's parameters: all scenes run one by one.
+            break
+        series = chebyshev.coefficients(inverse[: at.size])
+        # High powers of what is rounding would be large.
+        own = to_powers @ np.where(np.abs(series) < 1e-15 * np.abs(series).max(axis=0), 0.0, series)
+        between = np.polyval(own, every[at.size :, None]) / inverse[at.size :]
         # NaN, where an area is missing, is not small.
-        good = np.abs(series[-2:]).max(axis=0) <= _LAW_ERROR * np.abs(series).max(axis=0)
+        good = np.abs(between - 1.0).max(axis=0) <= _LAW_ERROR
         xi[missing[good]] = LARGEST_X / top[good]
-        found[:, missing[good]] = to_powers @ inverse.reshape(u.shape)[:, good]
+        found[:, missing[good]] = own[:, good]
     return xi, found
 
 
@@ -269,17 +278,17 @@ def curves_of(m: float, n: float, degree: int) -> tuple[FloatArray, FloatArray, 
     series = chebyshev.fit(lambda x: universal_curve_array(x, 1.0 / m, p), 0.0, LARGEST_X, _CURVE_ERROR, _CURVE_SIZES)
     if series is None:
         return None
-    return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), *_to_powers(degree)
+    return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), *_to_powers(degree)[:2]
 
 
 @lru_cache(maxsize=32)
-def _to_powers(degree: int) -> tuple[FloatArray, FloatArray]:
-    """Chebyshev nodes, and the matrix from values there to the powers of their polynomial, the highest first."""
+def _to_powers(degree: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Chebyshev nodes, and the matrices from values there, and from a series, to powers, the highest first."""
     to_powers = np.zeros((degree + 1, degree + 1))
     for k, one in enumerate(np.eye(degree + 1)):
         to_powers[: k + 1, k] = powers.cheb2poly(one[: k + 1])
     highest_first = (to_powers @ chebyshev.coefficients(np.eye(degree + 1)))[::-1]
-    return chebyshev.nodes(degree + 1, -1.0, 1.0), np.ascontiguousarray(highest_first)
+    return chebyshev.nodes(degree + 1, -1.0, 1.0), np.ascontiguousarray(highest_first), to_powers[::-1]
 
 
 class Run(NamedTuple):
@@ -409,7 +418,9 @@ class Ladder:
         """Integrate scenes, for half the steps, too, where `before` has no results; None: no curve."""
         task, form, halves, columns = self.task, self.form, self.halves, self._columns(pending)
         own = form.gap.values
-        curves = (np.zeros(0), *_to_powers(degree)) if form.gap.law else curves_of(own["m_exp"], own["n_exp"], degree)
+        curves = (
+            (np.zeros(0), *_to_powers(degree)[:2]) if form.gap.law else curves_of(own["m_exp"], own["n_exp"], degree)
+        )
         if curves is None:
             return None
         sizes, recorded = (steps // 2 if before is None else 0, steps), form.recording is not None
