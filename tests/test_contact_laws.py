@@ -1,5 +1,6 @@
 """Contact laws other than the paper's: a law of one's own, a table and the shipped ones, through every kind of run."""
 
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -178,6 +179,34 @@ def test_the_papers_law_by_name_changes_nothing() -> None:
 SHORT = fs.ContactLaw.from_table("short", [0.0, 20.0, 50.0], [35e-6, 36e-6, 37e-6])
 
 
+def test_laws_of_one_name_are_told_apart_by_what_they_do(tmp_path: Path) -> None:
+    first, second = (
+        table1().replace({"Xgap.law": fs.ContactLaw.from_table("same", [0.0, 90.0, 200.0], [35e-6, area, area])})
+        for area in (35e-6, 70e-6)
+    )
+    fs.simulate(first).to_netcdf(tmp_path / "run.nc")
+    with pytest.warns(fs.FingerspiceWarning, match="its contact law is another one now"):
+        fs.load(tmp_path / "run.nc")
+    kept = fs.simulate(pickle.loads(pickle.dumps(second))).area
+    np.testing.assert_array_equal(kept, fs.simulate(second).area)
+    changed = table1().replace({"Xgap.beta": 40.0, "Xgap.d": 3e-6}).replace({"Xgap.law": "dmt"})
+    assert dict(changed.overrides) == {"Xgap.d": "3e-06", "Xgap.law": "dmt"}
+
+
+def test_a_function_of_one_scene_alone_runs_scenes_one_by_one() -> None:
+    law = fs.ContactLaw("single", lambda u, p: np.full(u.shape, 2e-6 if p["fn"] > 0.4 else 1e-6))
+    found = fs.batch(table1().replace({"Xgap.law": law}), {"Xgap.fn": [0.3, 0.5]}, outputs=["f_el_mean"])
+    assert found.attrs["n_ordinary"] == 2
+    assert np.all(np.isfinite(found.f_el_mean))
+
+
+def test_under_a_current_source_areas_end_where_they_are_not_known() -> None:
+    lines = ["Idrive 0 drive SIN(0 5e-4 100)", *finger("drive", "foot", f=100.0), "Rf foot 0 1", ".tran 10u 30m uic"]
+    for more in ({}, {"Xgap.tau": 1e-3}):
+        with pytest.raises(fs.InputError, match="passes 300 V, up to which areas of the contact law dmt are known"):
+            fs.simulate(deck(*lines).replace({"Xgap.law": "dmt", **more}))
+
+
 def test_a_law_has_sliders_and_a_deck_of_the_page() -> None:
     deck_text = table1_deck(gap={"law": "linear", "slope": 60.0, **dict.fromkeys(PAPERS)})
     given = {"deck": deck_text, "overrides": {"Xgap.slope": 70.0}}
@@ -192,6 +221,9 @@ def test_a_law_has_sliders_and_a_deck_of_the_page() -> None:
     ("make", "said"),
     [
         (lambda: table1(gap={"law": "dmd"}), "contact law is 'dmd'; allowed: jkr, dmt, linear"),
+        (lambda: table1().replace({"Xgap.law": "dmt", "Xgap.m_exp": 1.0}), "Xgap m_exp is 1; allowed: more than 0"),
+        (lambda: fs.ContactLaw("own", pulled, ["k"]), "allowed: a mapping such as"),  # type: ignore[arg-type]
+        (lambda: fs.ContactLaw("own", pulled, {"k": np.inf}), "allowed: a finite number"),
         (lambda: table1(gap={"law": "dmt"}), "GAP with law=dmt has no parameter"),
         (lambda: table1().replace({"Xgap.law": "tabor"}), "contact law is 'tabor'"),
         (lambda: table1().replace({"Xgap.law": "dmt", "Xgap.beta": 3.0}), "unknown parameter 'Xgap.beta'"),

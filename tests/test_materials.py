@@ -207,3 +207,9 @@ def test_a_constant_phase_element_is_the_same_in_ngspice() -> None:
     run = run_ngspice(text)
     ours = fs.simulate(fs.parse_netlist(text), t_eval=np.clip(run["time"], 0.0, 0.02), rtol=1e-6)
     assert np.abs(run["v(top)-v(skin)"] - ours.u_gap).max() <= 3e-4 * np.abs(ours.u_gap).max()
+
+
+@pytest.mark.parametrize("values", ["q=1n n_cpe=0", "q=1n n_cpe=1", "q=0 n_cpe=0.5", "q=1n n_cpe=-0.5"])
+def test_a_constant_phase_elements_range_is_told_at_its_call(values: str) -> None:
+    with pytest.raises(fs.InputError, match=r"<netlist>:3:\d+: Xq: CPE has q=.* allowed: q above 0, and n_cpe between"):
+        deck("V1 a 0 1", f"Xq a 0 CPE {values}")

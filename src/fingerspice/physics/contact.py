@@ -29,7 +29,7 @@ N_PACKED = 8
 # Terms that a curve may have, and its error, relative to the largest 1/A. Of a rough function's: that error, the one of
 # any area at the places where it is checked, and terms.
 _SIZES, _ERROR, _CHECKED = (32, 48), 2e-15, 1025
-_ROUGH = ((1e-12, 1e-10, (96, 192)), (1e-9, 1e-8, (384, 768)), (1e-6, 3e-5, (768,)))
+_ROUGH = ((1e-12, 1e-10, (96, 192)), (1e-9, 1e-8, (384, 768)), (1e-6, 1e-4, (768,)))
 # How far below 0 V the curve of an even function reaches, and where a curve ends before the end of the areas: both over
 # the largest voltage.
 _EVEN, _BEFORE_END = 0.3, (0.999, 0.99, 0.95)
@@ -239,7 +239,7 @@ class LawContact(Contact):
         Raises
         ------
         InputError
-            If these do not give 3e-5 of every area, and without an area at 0 V.
+            If these do not give 1e-4 of every area, and without an area at 0 V.
         """
         reach = self.reach(u_max)
         # Where the areas end, their slope may have none: the curve then ends a little before.
@@ -258,7 +258,7 @@ class LawContact(Contact):
                         if missed <= allowed:
                             return _continued(lo, hi, series, self.packed)
         said = f"the contact law {self.law} is too rough up to {reach:.4g} V: {_ROUGH[-1][-1][-1]} terms miss some area"
-        raise InputError(f"{said} by {min(missed, 1.0):.2g}; allowed: 3e-5, so areas without jumps and in usual units")
+        raise InputError(f"{said} by {min(missed, 1.0):.2g}; allowed: 1e-4, so areas without jumps and in usual units")
 
 
 def _continued(lo: float, hi: float, series: FloatArray, packed: FloatArray) -> FloatArray:
