@@ -27,7 +27,7 @@ from fingerspice.circuit.devices import (
     mega_note,
     unit_trap,
     unusual_of_changed,
-)  # fmt: skip
+)
 from fingerspice.circuit.laws import ContactLaw, law_of
 from fingerspice.waveforms.waveform import Waveform, as_waveform, refuse, require
 

@@ -57,14 +57,19 @@ def in_force(circuit: Circuit) -> dict[str, tuple[dict[str, Any], tuple[str, ...
     return found
 
 
+def law_digest(element: Element) -> str:
+    """What tells a GAP's contact law from others, of the same name too; empty for the paper's and other devices."""
+    contact = contact_of(element) if element.law is not None else None
+    return f"{contact.law} {contact.digest}" if isinstance(contact, LawContact) else ""
+
+
 def digests(circuit: Circuit) -> tuple[str, str]:
     """SHA-256 of a circuit's elements, initial voltages and step control, and of its sources' waveforms."""
     elements, sources, tran = hashlib.sha256(), hashlib.sha256(), circuit.tran
     for element in circuit.elements:
         wave = element.waveform
         elements.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
-        if isinstance(contact := contact_of(element) if element.law else None, LawContact):
-            elements.update(f"{contact.law} {contact.digest}".encode())
+        elements.update(law_digest(element).encode())
         sources.update(repr((element.name, wave.digest() if isinstance(wave, Samples) else wave)).encode())
     elements.update(repr((dict(circuit.initial), tran and (tran.max_step, tran.uic))).encode())
     return elements.hexdigest(), sources.hexdigest()

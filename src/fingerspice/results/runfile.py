@@ -28,11 +28,11 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import UNFINISHED, settle_on_disk, write_pieces
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran
+from fingerspice.circuit.describe import law_digest
 from fingerspice.circuit.laws import ContactLaw, law_of
 from fingerspice.circuit.network import checked
-from fingerspice.circuit.statespace import contact_of
 from fingerspice.numerics.lobatto import NODES
-from fingerspice.physics.contact import Contact, LawContact
+from fingerspice.physics.contact import Contact
 from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import StoredRecord, kept_rows, variables
 from fingerspice.results.solution import Solution
@@ -255,7 +255,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             run |= {
                 "sources": list(solution.sources), "signals": list(solution.signals),
                 "contacts": [[name, _of_contact(contact)] for name, contact in solution.record.fingers],
-                "laws": _laws(solution.circuit),
+                "laws": [law_digest(e) for e in solution.circuit.elements],
                 "overrides": dict(solution.circuit.overrides), "summary": solution.summary(), "circuit": circuit,
                 "arrays": len(arrays), "between": between and between[0],
             }  # fmt: skip
@@ -279,12 +279,6 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
 
 def _of_contact(contact: Contact) -> dict[str, float]:
     return {name: getattr(contact, name) for name in _OF_CONTACT}
-
-
-def _laws(circuit: Circuit) -> dict[str, str]:
-    """Digests of contact laws other than the paper's, by GAP."""
-    found = {e.name: contact_of(e) for e in circuit.elements if e.law is not None}
-    return {name: contact.digest for name, contact in found.items() if isinstance(contact, LawContact)}
 
 
 def load(path: str | Path) -> Solution:
@@ -365,7 +359,7 @@ def _circuit(file: Any, run: dict[str, Any]) -> Circuit:
             raise ValueError(kept)
         arrays = [np.asarray(group.variables[f"circuit{k}"][...], float) for k in range(int(run["arrays"]))]
         again = made_again(kept, arrays)
-        if _laws(again) != run.get("laws", {}):
+        if (laws := [law_digest(e) for e in again.elements]) != run.get("laws", [""] * len(laws)):
             raise ValueError("its contact law is another one now")
         return again._with(text=_text(file.attrs["deck"]))
     except (InputError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError) as error:

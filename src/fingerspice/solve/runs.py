@@ -300,6 +300,13 @@ def _written(problem: Problem, place: int) -> list[str]:
     return [e.name for e, _ in (drives if problem.network.inner else drives[place : place + 1])]
 
 
+def refuse_beyond_law(problem: Problem, area: int, u: float, when: str = "") -> None:
+    """Refuse a largest gap voltage `u` (V) beyond the areas that are known of its contact law."""
+    contact, net = problem.network.contacts[area], problem.scene.net
+    if isinstance(contact, LawContact) and net.gap[area] >= 0 and u > net.curves[area, 1]:
+        raise InputError(f"{when}{contact.ends(float(net.curves[area, 1]))}")
+
+
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Warnings for every limit of the model that the run exceeds."""
     success, several, net = run.status is Status.SUCCESS, len(record.fingers) > 1, problem.scene.net
@@ -319,8 +326,7 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     for finger, (name, contact) in enumerate(record.fingers):
         u_peak, f_peak, u_error, _ = run.gaps[finger].tolist()
         where, i = f" of {name}" if several else "", problem.network.fingers[finger]
-        if isinstance(contact, LawContact) and net.gap[i] >= 0 and u_peak > net.curves[i, 1]:
-            raise InputError(contact.ends(float(net.curves[i, 1])))
+        refuse_beyond_law(problem, i, u_peak)
         unloaded = least = largest = float(net.area0[i])
         if net.slow[i] >= 0:
             area = record.each("area")[finger]

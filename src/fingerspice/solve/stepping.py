@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.errors import InputError
 from fingerspice.base.units import format_si
 from fingerspice.engine.collocation import loop, readout
 from fingerspice.engine.collocation.loop import Circuit, Looks
@@ -17,12 +16,11 @@ from fingerspice.engine.collocation.readout import LoopState, Outputs
 from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Sources
 from fingerspice.engine.one_area.system import area_missed
-from fingerspice.physics.contact import LawContact
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.steps import Recorder
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Integration, Run, excess_of, with_error
+from fingerspice.solve.runs import Integration, Run, excess_of, refuse_beyond_law, with_error
 from fingerspice.waveforms.sampling import same_time
 
 FEWEST_PERIODS = 6.0  # Runs of fewer periods are integrated throughout, because nothing would be saved
@@ -129,11 +127,8 @@ class Stepping(Integration):
 
     def failed(self, code: int, sources: Sources) -> Status:
         """Status of a run whose loop ended with a code other than DONE; a contact law may have ended before."""
-        net = self.problem.scene.net
-        for i, contact in enumerate(self.problem.network.contacts):
-            met = float(self.peaks[i, readout.PEAK_U])
-            if isinstance(contact, LawContact) and net.gap[i] >= 0 and met > net.curves[i, 1]:
-                raise InputError(f"at {format_si(self.t, 's')} {contact.ends(float(net.curves[i, 1]))}")
+        for i in self.problem.network.fingers:
+            refuse_beyond_law(self.problem, i, float(self.peaks[i, readout.PEAK_U]), f"at {format_si(self.t, 's')} ")
         return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:

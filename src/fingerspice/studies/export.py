@@ -159,10 +159,8 @@ def _start_lines(circuit: Circuit, areas: Mapping[str, float], contacts: Mapping
             # An area with a delay is a state and needs a start value; for an area without delay a guess is enough.
             held, guess = areas[node] if gap.values["tau"] > 0.0 else None, areas[node]
         yield f"{'.nodeset' if held is None else '.ic'} v({written[node]})={guess if held is None else held!r}"
-        if areas and circuit.initial and not gap.values["a_fix"]:
+        if areas and circuit.initial and not gap.values["a_fix"] and isinstance(contact, JkrContact):
             # Without guesses for the nodes inside a GAP, ngspice's first Newton iteration fails at u != 0.
-            if not isinstance(contact, JkrContact):
-                continue
             u, name = start_voltage(gap, circuit.initial), _element_name(gap)
             y = float(contact.area_adhesive(u)) / (at_rest := float(contact.area_adhesive(0.0)))
             pull, area = float(contact.stress(u)) * at_rest / contact.f_n, 1e6 * float(contact.area(u))
