@@ -149,6 +149,77 @@ def test_the_export_for_ngspice_has_the_areas_as_points() -> None:
     np.testing.assert_allclose(run["v(area)"], 1e6 * ours.area, rtol=2e-4)
 
 
+def two_scales(u: float, p_sat: float) -> tuple[float, float]:
+    """Ridge and real area, m^2: Eq. 4, and A = A0 - (c2 / A0) F_T^2, F_T = sqrt(pi/8) mu p_sat A_real; 30 digits."""
+    with mp.workdps(30):
+        sigma, load = mp.mpf(stress(u)), mp.mpf(P.force_normal)
+        first, p = ref.ridge_area_unloaded_mp(u, P, 30), mp.mpf(p_sat)
+        real = lambda a: a * mp.erf(mp.sqrt(2) * (load + sigma * a) / a / p)  # noqa: E731
+        loss = lambda a: P.c2 / first * (mp.sqrt(mp.pi / 8) * P.mu0 * p * real(a)) ** 2  # noqa: E731
+        area = mp.findroot(lambda a: a - first + loss(a), (first / 100, first), solver="anderson")
+        return float(area), float(real(area))
+
+
+@pytest.mark.parametrize("p_sat", [50e3, 300e3])
+def test_a_saturating_contact_has_the_areas_and_the_friction_of_its_equations(p_sat: float) -> None:
+    solution = fs.simulate(table1(gap={"p_sat": p_sat}), t_eval=TIMES, rtol=1e-8)
+    area, real = np.array([two_scales(abs(u), p_sat) for u in solution.u_gap.tolist()]).T
+    np.testing.assert_allclose(solution.area, area, rtol=1e-10)
+    np.testing.assert_allclose(solution.a_real, real, rtol=1e-10)
+    np.testing.assert_allclose(solution.f_t, np.sqrt(np.pi / 8.0) * P.mu0 * p_sat * real, rtol=1e-10)
+    np.testing.assert_allclose(solution.friction, solution.f_t / P.force_normal, rtol=1e-14)
+    areas = np.vectorize(lambda u: two_scales(u, p_sat)[0])
+    found = reference(areas, TIMES[:6], sine_slope)
+    assert np.abs(solution.u_gap[:6] - found).max() <= max(solution.error.u_gap, 1e-8 * abs(solution.u_gap).max())
+
+
+def test_without_a_limit_of_the_pressure_nothing_changes_and_the_real_area_grows_by_the_square() -> None:
+    plain, hard = fs.simulate(table1()), fs.simulate(table1(gap={"p_sat": 1e9}))
+    np.testing.assert_allclose(hard.u_gap, plain.u_gap, atol=hard.error.u_gap + plain.error.u_gap)
+    np.testing.assert_allclose(hard.f_t, plain.f_t, rtol=1e-9)
+    assert plain.a_real is None
+    assert not plain.by_name("a_real")
+    u = np.array([75.0, 100.0, 125.0, 150.0])
+    runs = [fs.steady_state(table1(gap={"p_sat": 300e3}).replace({"Vdrive": fs.Sine(x, 100.0)})) for x in u]
+    growth = np.array([run.a_real_mean for run in runs]) - two_scales(0.0, 300e3)[1]
+    assert np.polyfit(np.log(u), np.log(growth), 1)[0] == pytest.approx(1.98, abs=0.02)
+
+
+def test_the_real_area_is_saved_fitted_and_differentiated_and_needs_its_pressure(tmp_path: Path) -> None:
+    circuit = table1(gap={"p_sat": 300e3})
+    run = fs.simulate(circuit, sensitivities=["Xgap.p_sat"])
+    run.to_netcdf(tmp_path / "run.nc")
+    loaded = fs.load(tmp_path / "run.nc")
+    np.testing.assert_array_equal(loaded.a_real, run.a_real)
+    assert loaded.summary()["a_real_mean"] == run.a_real_mean
+    slope = run.sensitivities["Xgap.p_sat"].a_real_mean
+    ends = [fs.simulate(table1(gap={"p_sat": 300e3 * by}), rtol=1e-10).a_real_mean for by in (0.999, 1.001)]
+    assert slope == pytest.approx((ends[1] - ends[0]) / 600.0, rel=1e-5)
+    u = [60.0, 120.0, 180.0]
+    found = fs.batch(circuit, {"Vdrive.amplitude": u}, outputs=["a_real_mean", "f_t_mean"], periodic=True, rtol=1e-7)
+    data = {"Vdrive.amplitude": u, "a_real_mean": found.a_real_mean.to_numpy()}
+    fitted = fs.fit(circuit.replace({"Xgap.p_sat": 200e3}), data, ["Xgap.p_sat"])
+    assert fitted.estimates["Xgap.p_sat"].value == pytest.approx(300e3, rel=1e-5)
+    for refused in (
+        lambda: fs.batch(table1(), {"Xgap.d": [3e-6]}, outputs=["a_real_mean"]),
+        lambda: fs.torch.Simulator(table1(), ["Xgap.d"], "a_real_mean"),
+    ):
+        with pytest.raises(fs.InputError, match="a_real_mean is asked for, and no GAP has a real area"):
+            refused()
+    with pytest.raises(fs.InputError, match="Xgap has p_sat=300000 Pa: friction saturates"):
+        fs.inverse_drive(circuit, friction=lambda t: 0.16 + 0 * t, rate=1e4)
+    with pytest.raises(fs.InputError, match=r"Xgap\.p_sat is 300000 Pa"):
+        fs.fit_contact(circuit, {"fn": [0.2, 0.5], "f_t": [0.06, 0.15]}, ["Xgap.mu"])
+
+
+def test_ngspice_agrees_with_a_saturating_contact_and_refuses_it_without_its_areas() -> None:
+    circuit = table1(gap={"p_sat": 50e3}, tran="2u 20m 0 2u uic")
+    run = run_ngspice(fs.export_netlist(circuit), ("v(top)-v(skin)", "v(area)"))
+    ours = fs.simulate(circuit, t_eval=np.clip(run["time"], 0.0, 0.02), rtol=1e-8)
+    assert np.abs(run["v(top)-v(skin)"] - ours.u_gap).max() <= 1e-4 * np.abs(ours.u_gap).max()
+    np.testing.assert_allclose(run["v(area)"], 1e6 * ours.area, rtol=2e-4)
+
+
 def test_a_file_keeps_the_law_and_the_figures(tmp_path: Path) -> None:
     solution = fs.simulate(table1().replace(OWN))
     solution.to_netcdf(tmp_path / "run.nc")

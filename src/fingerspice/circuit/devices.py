@@ -66,6 +66,7 @@ Value = float | FloatArray
 #: Function from an element's values (in the netlist's units), or those of several scenes (n,), to its cells in series,
 #: shape (n_cell, 3) or (n_cell, 3, n): capacitance per area (F/m^2), total leakage (S) and leakage per area (S/m^2). At
 #: a frequency (Hz), the second argument if not None, a dispersive material becomes one cell with its data there.
+PHASE_POLES = 2.0 * np.pi * 10.0 ** np.arange(0.5, 5.6, 0.5)  #: Of a constant-phase element, 1/s, but for the two ends.
 Cells = Callable[[Mapping[str, Value], float | None], FloatArray]
 
 
@@ -103,7 +104,7 @@ class ParameterSpec:
 
 @dataclass(frozen=True)
 class DeviceSpec:
-    """A device: its nodes, its parameters, and for a layer the function that gives its cells."""
+    """A device: its nodes, its parameters, and the function that gives its cells, if it has such."""
 
     name: str
     nodes: tuple[str, ...]
@@ -116,7 +117,7 @@ class DeviceSpec:
     place: int = 4  # Among the explorer's sliders
 
     def __post_init__(self) -> None:
-        if self.is_layer != (self.cells is not None):
+        if self.is_layer and self.cells is None:
             raise TypeError(f"device {self.name}: an area node and cells belong together; give both, or neither")
 
     def parameter(self, name: str) -> ParameterSpec:
@@ -149,6 +150,25 @@ def _dispersive_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
     return _cells(np.divide.outer(EPS0 * eps_r, v["d"]), 0.0, 1.0 / np.multiply.outer(rho, v["d"]))
 
 
+def _phase_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
+    """Of 1/(q s^n), a sum of poles: with h = ln(10)/2 and b = sin(n pi)/(pi q), at poles x the sizes b h x^(1-n).
+
+    Beyond the poles, and half a cell outside, one pole more at each end has the integral of b x^(-n)/(s + x) and its
+    first moment there. From 10 Hz to 100 kHz the element is exact to 0.5 %; phasors take q s^n itself.
+    """
+    n, q = (x[None] for x in np.broadcast_arrays(v["n_cpe"], v["q"]))
+    step, x = math.log(10.0) / 2.0, np.multiply.outer(PHASE_POLES, np.ones_like(n[0]))
+    low, high = x[:1] * math.exp(-0.5 * step), x[-1:] * math.exp(0.5 * step)
+    poles = np.concatenate([low * (1.0 - n) / (2.0 - n), x, high * (1.0 + n) / n])
+    sizes = np.concatenate([low ** (1.0 - n) / (1.0 - n), step * x ** (1.0 - n), high ** (1.0 - n) * (1.0 + n) / n**2])
+    c = q * np.pi / (np.sin(np.pi * n) * sizes)
+    return _cells(c, poles * c, 0.0 * c)
+
+
+def _phase_layer_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
+    return _phase_cells(v, at)[:, [0, 2, 1]]
+
+
 _DATA = tomllib.loads(Path(__file__).with_name("devices.toml").read_text(encoding="utf-8"))
 _USUAL, SOURCES, MEASURED = (
     {name: Usual(**one) for name, one in _DATA[table].items()} for table in ("usual", "sources", "measured")
@@ -161,7 +181,7 @@ REST_AREA, MEASURING = _USUAL["rest_area"], _USUAL["measuring"]
 MEANINGS, FIRST_OF_SOURCES = _DATA["waveforms"]["meanings"], _DATA["waveforms"]["first"]
 _CELLS: Mapping[str, Cells] = {
     "LAYER": _layer_cells, "SLAB": _layer_cells, "GAP": _layer_cells,
-    "SKIN": _skin_cells, "SKIN_DISPERSIVE": _dispersive_cells,
+    "SKIN": _skin_cells, "SKIN_DISPERSIVE": _dispersive_cells, "CPE": _phase_cells, "CPE_LAYER": _phase_layer_cells,
 }  # fmt: skip
 
 
@@ -174,12 +194,12 @@ def _device(name: str, parameters: Iterable[dict[str, Any]] = (), **given: Any) 
 
 DEVICES = {one["name"]: _device(**one) for one in _DATA["device"]}  #: Every device that the reader knows, by name.
 #: Parameters of GAP that do not belong to the paper's contact law.
-OF_EVERY_LAW = ("d", "eps_r", "r", "fn", "mu", "a_fix", "tau")
+OF_EVERY_LAW = ("d", "eps_r", "r", "fn", "mu", "a_fix", "tau", "p_sat", "q", "n_cpe")
 
 
-def layer_devices() -> tuple[str, ...]:
-    """Names of the layer devices, which X lines may call without a definition in the netlist."""
-    return tuple(name for name, spec in DEVICES.items() if spec.is_layer)
+def called_devices() -> tuple[str, ...]:
+    """Names of the devices that X lines may call without a definition in the netlist."""
+    return tuple(name for name, spec in DEVICES.items() if spec.cells is not None)
 
 
 # Values
@@ -256,6 +276,8 @@ def _check_element(element: Element) -> None:
         if not spec.accepts(v[spec.name]):
             given = f"{v[spec.name]:g} {spec.unit}".rstrip()
             raise InputError(f"{element.name} {spec.name} is {given}; allowed: {spec.allowed()}", element.where)
+    if element.device == "GAP" and v["q"] > 0.0 and v["n_cpe"] == 0.0:
+        raise InputError(f"{element.name} has q and no n_cpe; allowed: n_cpe between 0 and 1", element.where)
     if element.device != "GAP" or element.law is not None:
         return
     m, n, fault = v["m_exp"], v["n_exp"], ""
@@ -265,7 +287,7 @@ def _check_element(element: Element) -> None:
     elif not (total := 1.0 / m + 1.0 / n) > 1.0:
         allowed = "more than 1 (else Eq. 4 has no single root)"
         fault = f"exponents {exponents} give 1/m + 1/n = {total:.4g}; allowed: {allowed}"
-    elif v["a_fix"] == 0.0 and not (area := v["alpha"] * v["fn"] ** m) > loss:
+    elif v["a_fix"] == 0.0 and math.isinf(v["p_sat"]) and not (area := v["alpha"] * v["fn"] ** m) > loss:
         hint = "".join(f"; note {text}" for _, text in unusual(element))
         fault = (
             f"has no contact: friction takes the whole ridge area at 0 V (A0 = alpha fn^m_exp = {area:.4g} mm^2, "

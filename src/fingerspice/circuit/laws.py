@@ -18,6 +18,7 @@ from fingerspice.physics import laws
 from fingerspice.waveforms.waveform import refuse, require
 
 if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Element
     from fingerspice.physics.contact import LawContact
 
 #: Name of the paper's law, which a GAP has by default; and every other law by its name.
@@ -29,15 +30,15 @@ class ContactLaw(Remembering):
     """A relation between gap voltage and ridge contact area, for ``law=`` of a GAP (docs/howto/contact-law.md).
 
     Decks that are read after it was made find it by its name. The area is independent of the charge law; of results,
-    only the area itself depends on the law: friction is mu (F_N + F_el).
+    only the area itself depends on the law: friction is mu (F_N + F_el), or with `p_sat` follows from both.
 
     Parameters
     ----------
     name : str
     area : callable
         ``area(u, p)``: ridge area, m^2, shape (n,), at gap voltages `u` of 0 V or more, shape (n,). The mapping `p` has
-        `d` (m), `eps_r`, `fn` (N) and `mu` of the GAP, and the law's own parameters. The areas may end at a voltage:
-        NaN, 0 or less stands for none.
+        `d` (m), `eps_r`, `fn` (N), `mu` and `p_sat` (Pa) of the GAP, and the law's own parameters. The areas may end at
+        a voltage: NaN, 0 or less stands for none.
     parameters : mapping of str to float, optional
         Own parameters with their defaults. Those of the paper's law (alpha, m_exp, beta, n_exp, c2) keep their units in
         decks, and are in SI units in `p`.
@@ -108,12 +109,17 @@ class ContactLaw(Remembering):
         """The contact of a GAP with this law and these values, SI; arrays (n,) stand for one at each gap voltage."""
         from fingerspice.physics.contact import LawContact
 
-        own = {name: v[name] for name in ("d", "eps_r", "fn", "mu", *self.parameters)}
-        return LawContact(v["d"], v["eps_r"], v["fn"], v["mu"], self.name, self.area, own)
+        own = {name: v[name] for name in ("d", "eps_r", "fn", "mu", "p_sat", *self.parameters)}
+        return LawContact(v["d"], v["eps_r"], v["fn"], v["mu"], self.name, self.area, own, p_sat=v["p_sat"])
 
 
 def _of_table(table: Callable[[FloatArray], FloatArray], u: FloatArray, p: Mapping[str, float]) -> FloatArray:
     return np.asarray(table(u))
+
+
+def acting_law(gap: Element) -> ContactLaw | None:
+    """The law of a GAP's area; None for the paper's where it is in closed form, as it is without `p_sat`."""
+    return gap.law or (None if math.isinf(gap.values["p_sat"]) else _TWO_SCALES)
 
 
 def law_of(given: object) -> ContactLaw | None:
@@ -126,9 +132,13 @@ def law_of(given: object) -> ContactLaw | None:
 
 
 _OWN: tuple[str, ...] = ()
+_PAPERS = (p.name for p in DEVICES["GAP"].parameters if p.name not in OF_EVERY_LAW)
 # From m_exp = 1 on there is no area, or two.
 _BELOW_1 = dataclasses.replace(DEVICES["GAP"].parameter("m_exp"), most=0.999)
 ContactLaw("dmt", laws.dmt, {"alpha": 54.4, "m_exp": _BELOW_1})
 _SLOPE = ParameterSpec("slope", "mm^2/N", 72.5, meaning="area per load")
 ContactLaw("linear", laws.linear, {"slope": _SLOPE, "a_max": ParameterSpec("a_max", "mm^2", 100.0, meaning="largest")})
+# Not by a name, but wherever the paper's law has a p_sat.
+_TWO_SCALES = ContactLaw("two_scales", laws.two_scales, dict.fromkeys(_PAPERS, 1.0))
+del LAWS["two_scales"]
 _OWN = (PAPER, *LAWS)

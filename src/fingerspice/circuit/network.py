@@ -25,7 +25,7 @@ from fingerspice.base.arrays import ComplexArray, FloatArray, Remembering
 from fingerspice.base.errors import InputError
 from fingerspice.circuit import statespace
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.devices import check
+from fingerspice.circuit.devices import PHASE_POLES, check
 from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of, find_branches, shared
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
@@ -155,9 +155,13 @@ class Network(Remembering):
         f = np.asarray(frequency, float)
         y = self.leak(area) + 2j * np.pi * f[..., None] * self.capacitance(area)
         for i, cell in enumerate(self.cells):
-            if cell.element.device == "SKIN" and cell.area is not None:
+            v, size = cell.element.values, 1.0 if cell.area is None else area[cell.area]
+            if cell.element.device == "SKIN":
                 per_area = 1.0 / skin_resistivity(f) + 2j * np.pi * f * EPS0 * skin_permittivity(f)
-                y[..., i] = per_area * area[cell.area] / cell.element.values["d"]
+                y[..., i] = per_area * size / v["d"]
+            elif cell.element.device in ("CPE", "CPE_LAYER"):
+                # Equal shares of q s^n, of as many cells as its ladder has in series.
+                y[..., i] = (PHASE_POLES.size + 2) * v["q"] * (2j * np.pi * f) ** v["n_cpe"] * size
         return np.asarray(y)
 
     def phasors(self, frequency: ArrayLike, area: FloatArray, s: ComplexArray) -> ComplexArray:
@@ -261,10 +265,12 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
     a, b, *area = element.nodes
     if element.device == "C":
         return [Cell(element, (a, b), None, element.values["value"], 0.0, 0.0)]
-    constants = statespace.layer_constants(element).tolist() if area else []
-    # The nodes between the slabs of a dispersive layer have names that no netlist can write.
+    constants = [] if element.spec.cells is None else statespace.layer_constants(element).tolist()
+    # The nodes between an element's cells have names that no netlist can write.
     path = [a, *(f"{element.name.lower()} {i}" for i in range(1, len(constants))), b]
-    return [Cell(element, ends, place[area[0]], *own) for own, ends in zip(constants, pairwise(path), strict=False)]
+    on = place[area[0]] if area else None
+    cells = [Cell(element, ends, on, *own) for own, ends in zip(constants, pairwise(path), strict=False)]
+    return cells + (_cells(beside, place) if (beside := statespace.beside_gap(element)) is not None else [])
 
 
 class Modes(NamedTuple):

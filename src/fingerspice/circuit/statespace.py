@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, Remembering, T
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.devices import PHASE_POLES
+from fingerspice.circuit.laws import acting_law
 from fingerspice.physics.contact import Contact, JkrContact
 from fingerspice.physics.materials import EPS0, SKIN_LADDER
 from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, refuse
@@ -101,7 +103,8 @@ def shared(circuit: Circuit, key: tuple[Any, ...], make: Callable[[], T]) -> T:
 def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
     """The hops and the area of a stack, a circuit of one series loop of sources and layers, from ground to ground.
 
-    None for any other circuit, and for an area that follows with delay. Related circuits share the way round the loop.
+    None for any other circuit, for an area that follows with delay, and for a gap with a constant-phase element beside
+    it. Related circuits share the way round the loop.
     """
 
     def make() -> tuple[tuple[Hop, ...], Area] | None:
@@ -109,7 +112,8 @@ def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
         if walked is None:
             return None
         (area,) = shared(circuit, ("areas",), lambda: _areas(circuit))
-        if area.gap is not None and area.gap.values["tau"] > 0.0 and area.given is None:
+        delayed = area.gap is not None and area.gap.values["tau"] > 0.0 and area.given is None
+        if delayed or (area.gap is not None and area.gap.values["q"] > 0.0):
             return None
         now = {e.name: e for e in circuit.elements}
         return tuple(hop._replace(element=now[hop.element.name]) for hop in walked), area
@@ -143,8 +147,18 @@ def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
 
 
 def count_of(circuit: Circuit) -> int:
-    """Number of elements of a circuit, each dispersive skin counted as its slabs."""
-    return len(circuit.elements) + (SLABS - 1) * len(circuit.by_device("SKIN_DISPERSIVE"))
+    """Number of elements of a circuit, each dispersive skin counted as its slabs, and likewise of constant phase."""
+    slabs = (SLABS - 1) * len(circuit.by_device("SKIN_DISPERSIVE"))
+    phases = len(circuit.by_device("CPE", "CPE_LAYER")) + sum(beside_gap(e) is not None for e in circuit.elements)
+    return len(circuit.elements) + slabs + (PHASE_POLES.size + 1) * phases
+
+
+def beside_gap(element: Element) -> Element | None:
+    """The constant-phase element that a GAP has beside it; None without a `q`, and for other devices."""
+    if element.device != "GAP" or element.values["q"] == 0.0:
+        return None
+    values = MappingProxyType({name: element.values[name] for name in ("q", "n_cpe")})
+    return Element(f"{element.name}_cpe", "CPE", element.nodes[:2], element.node_names[:2], values)
 
 
 def _areas(circuit: Circuit) -> tuple[Area, ...]:
@@ -387,8 +401,8 @@ def contact_of(gap: Element) -> Contact:
         # A product may overflow, or a logarithm be taken of one that underflows.
         with suppress(ArithmeticError, ValueError):
             v = in_si(gap, gap.values)
-            if gap.law is not None:
-                return gap.law.contact(v)
+            if (law := acting_law(gap)) is not None:
+                return law.contact(v)
             names = ("d", "eps_r", "fn", "mu", "alpha", "m_exp", "beta", "n_exp", "c2")
             contact = JkrContact(*(v[name] for name in names))
             if np.all(np.isfinite(contact.packed)):

@@ -14,10 +14,10 @@ from itertools import dropwhile
 from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
-from fingerspice.circuit.devices import DEVICES, layer_devices
+from fingerspice.circuit.devices import DEVICES, called_devices
 from fingerspice.netlist.expressions import Bare, Call, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
-from fingerspice.netlist.reader import DIRECTIVES, LIBRARIES, MAX_BYTES, OTHERS, SHIPPED, Deck, Statement, Subcircuit
+from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, OTHERS, Deck, Statement, Subcircuit
 from fingerspice.netlist.sources import SOURCES
 from fingerspice.waveforms.waveform import refuse
 
@@ -29,7 +29,7 @@ MAX_DEPTH = 32
 
 _STATEMENT = re.compile(  #: Titles that are probably the netlist's first statement.
     rf"[rcvi]\w*\s+\S+\s+\S+\s+(?:\{{|'|[-+.\d]|(?:dc|ac|sine|{'|'.join(SOURCES)})\b)"
-    rf"|(?:x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})|{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
+    rf"|(?:x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(called_devices())})|{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
     re.IGNORECASE,
 )
 
@@ -151,8 +151,8 @@ class _Instance:
         refuse(device.kind != "word", f"{device.written} stands where a device's name belongs", device)
         native, key = device.text.upper(), device.text.lower()
         around = tuple(dropwhile(lambda one: key not in one.definition.inner, (self, *self.around)))
-        called = around[0].definition.inner[key] if around else self.deck.shipped_definition(key)
-        if called is None and native not in layer_devices():
+        called = around[0].definition.inner[key] if around else None
+        if called is None and native not in called_devices():
             raise InputError(_unknown_device(plain, self), device.where)
         shown, wanted = (called.name, called.ports) if called else (native, DEVICES[native].nodes)
         if len(nodes) != len(wanted):
@@ -187,12 +187,7 @@ class _Instance:
                 hint = nearest(parameter, allowed) or f"; it has {' '.join(allowed.values()) or 'none'}"
                 raise InputError(f"subcircuit '{called.name}' has no parameter '{word.text}'{hint}", word.where)
             inner.preset(parameter, scope.number(value))
-        values = inner.solve()
-        shipped = key in SHIPPED and called.where.file == LIBRARIES["local"]
-        if shipped and not (values["q"] > 0.0 and 0.0 < values["n_cpe"] < 1.0):
-            said = f"q={values['q']:g} and n_cpe={values['n_cpe']:g}"
-            raise InputError(f"{name}: CPE has {said}; allowed: q above 0, and n_cpe between 0 and 1", device.where)
-        _refuse_captured(called.name, values, words, scope)
+        _refuse_captured(called.name, inner.solve(), words, scope)
         _Instance(self.deck, called, inner, around, f"{name}.", ports, (*self.calls, called)).expand()
 
 
@@ -210,7 +205,7 @@ def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
     """The message that the last word of an X line is not a device, with a hint."""
     last = words[-1]
     inner = [one.definition.inner for one in (instance, *instance.around)]
-    visible = [*layer_devices(), *(sub.name for subs in inner for sub in subs.values())]
+    visible = [*called_devices(), *(sub.name for subs in inner for sub in subs.values())]
     known = {name.lower() for name in visible}
     for word in words[2:-1]:
         # A device's name after two words or more is probably the device, and the words after it lack their `key=`.
@@ -223,10 +218,10 @@ def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
 def _unknown_element(lexemes: list[Lexeme]) -> str:
     """The message that a line with these words is not an element, with a hint."""
     name = lexemes[0].text
-    if any(lexeme.text.upper() in layer_devices() for lexeme in lexemes[3:]):
+    if any(lexeme.text.upper() in called_devices() for lexeme in lexemes[3:]):
         return f"'{name}': a device's name begins with X, as in X{name}"
     if f".{name.lower()}" in DIRECTIVES:
         return f"'{name}': a directive begins with a dot, as in .{name.lower()}"
     kind = OTHERS["elements"].get(name[0].upper())
     what = f"'{name}' is {kind}, which is not supported" if kind else f"'{name}' is no known element"
-    return f"{what}; elements are R, C, V, I, and X with {', '.join(layer_devices())} or a .subckt"
+    return f"{what}; elements are R, C, V, I, and X with {', '.join(called_devices())} or a .subckt"

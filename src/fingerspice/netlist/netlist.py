@@ -196,7 +196,7 @@ def _law(statement: Statement) -> ContactLaw | None:
 
 def _device_values(statement: Statement, law: ContactLaw | None, notes: list[str]) -> dict[str, float]:
     name, device, params, where = statement.name, statement.device, statement.params, statement.where
-    refuse(statement.nodes[2] == "0", f"{name} has ground as its area; allowed: the area node of a GAP", where)
+    refuse(statement.nodes[2:3] == ("0",), f"{name} has ground as its area; allowed: the area node of a GAP", where)
     known = {p.name: p for p in (DEVICES[device] if law is None else law.spec).parameters}
     under = "" if law is None else f" with law={law.name}"
     for key, given in params.items():
@@ -335,8 +335,8 @@ def read_start(given: list[Call], elements: tuple[Element, ...], uic: bool) -> t
     """
     usage = "allowed: .ic v(node)=value"
     nodes = {node: None for e in elements for node in e.nodes}  # an ordered set
-    layers = [e for e in elements if e.spec.is_layer]
-    area_nodes = {e.nodes[2] for e in layers}
+    layers = [e for e in elements if e.spec.cells is not None]
+    area_nodes = {e.nodes[2] for e in layers if e.spec.is_layer}
     out: dict[str, float] = {}
     for directive in given:
         refuse(directive.args, f"{directive.line.strip()!r} is not understood; {usage}", directive)

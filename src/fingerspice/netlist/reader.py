@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import Tran
-from fingerspice.circuit.devices import layer_devices
+from fingerspice.circuit.devices import called_devices
 from fingerspice.netlist import lexer
 from fingerspice.netlist.expressions import Call, Value, Word, definitions
 from fingerspice.netlist.lexer import Assignment, Lexeme, Line, decimal_comma, group, lex, logical_lines, nearest
@@ -30,7 +30,6 @@ from fingerspice.waveforms.waveform import refuse
 
 #: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
-SHIPPED = ("cpe",)  #: Their subcircuits that are no device here: they are read from there wherever a deck calls them.
 
 MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30  #: Of a file, and of all the files that a deck's sources name.
 
@@ -274,17 +273,6 @@ class Deck:
             raise InputError(".control without its .endc", self._control.where())
         refuse(len(self._open) > 1, f".subckt {self._open[-1].name} without its .ends", self._open[-1])
 
-    def shipped_definition(self, name: str) -> Subcircuit | None:
-        """A subcircuit of the shipped library that is no device of its own, by its name in lower case."""
-        if name not in SHIPPED:
-            return None
-        if name not in self.root.inner:
-            _, begin, rest = shipped_text("local").partition(f".subckt {name.upper()} ")
-            body, end, _ = rest.partition(".ends\n")
-            for line in logical_lines(lexer.split_lines(begin + body + end), LIBRARIES["local"]):
-                self._take(line)
-        return self.root.inner[name]
-
     def warn(self, message: str, where: Where) -> None:
         """Keep a warning with its place, unless there are many already."""
         kept = self.warnings
@@ -366,7 +354,7 @@ class Deck:
         if not names or any(word.kind != "word" for word in names):
             raise InputError("write .subckt NAME node node ... key=value ...", line.where())
         name = names[0].text
-        if name.upper() in layer_devices():
+        if name.upper() in called_devices():
             self.warn(f"{name.upper()} is a native device: its .subckt is not read", names[0].where)
             return Subcircuit(name, line.where(), skipped=True)
         if words.stray is not None:

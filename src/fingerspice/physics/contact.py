@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -49,12 +49,15 @@ class Contact:
         Applied normal force, N.
     mu : float
         Friction coefficient.
+    p_sat : float
+        Pressure, Pa, far beyond which the real contact area is the ridge area; without a limit by default.
     """
 
     d: float
     eps_r: float
     f_n: float
     mu: float
+    p_sat: float = field(default=math.inf, kw_only=True)
 
     @cached_property
     def packed(self) -> FloatArray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +12,11 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import FloatArray
 from fingerspice.physics.materials import EPS0
 
+if TYPE_CHECKING:
+    from fingerspice.physics.contact import Contact
+
 Values = Mapping[str, float]
+_FRICTION = math.sqrt(math.pi / 8.0)  # Over mu p_sat A_real, by which it is mu times the load where A_real is small
 
 
 def stress(u: FloatArray, v: Values) -> FloatArray:
@@ -27,6 +33,25 @@ def root(residual: Callable[..., FloatArray], low: ArrayLike, high: ArrayLike, *
 
     found = find_root(residual, (low, high), args=values, tolerances={"xrtol": 4e-16, "xatol": 0.0, "fatol": 0.0})
     return np.asarray(found.x)
+
+
+def real_area(contact: Contact, f_el: ArrayLike, area: ArrayLike) -> FloatArray:
+    """Real contact area, m^2, under an electroadhesive force (N) on a ridge area (m^2); 0 without `p_sat`."""
+    return _real_area(contact.f_n + np.asarray(f_el), np.asarray(area), contact.p_sat)
+
+
+def friction(contact: Contact, f_el: ArrayLike, area: ArrayLike = math.nan) -> FloatArray:
+    """Friction force, N, likewise: mu (F_N + F_el) (Eq. 1), and with `p_sat` in proportion to the real area."""
+    if math.isinf(contact.p_sat):
+        return np.asarray(contact.mu * (contact.f_n + np.asarray(f_el)))
+    return _FRICTION * contact.mu * contact.p_sat * real_area(contact, f_el, area)
+
+
+def _real_area(load: FloatArray, area: FloatArray, p_sat: FloatArray | float) -> FloatArray:
+    """A erf(sqrt(2) N / (A p_sat)) (Persson 2001), where p_sat is the modulus times the rms slope of the asperities."""
+    from scipy.special import erf
+
+    return np.asarray(area * erf(math.sqrt(2.0) * load / (area * p_sat)))
 
 
 def dmt(u: FloatArray, v: Values) -> FloatArray:
@@ -54,3 +79,29 @@ def linear(u: FloatArray, v: Values) -> FloatArray:
         return np.asarray(most * erf(per * (load + s * a)) - a)
 
     return root(missing, 0.0, most, stress(u, v), most, load, per_load)
+
+
+def paper_constants(v: Values) -> tuple[FloatArray, FloatArray]:
+    """X at 1 V (see `fingerspice.physics.contact`) and the area A0 = alpha F_N^m (Eq. 5) of the paper's law."""
+    m, n, area = v["m_exp"], v["n_exp"], v["alpha"] * np.asarray(v["fn"]) ** v["m_exp"]
+    p, per_volt = 0.5 * (1.0 + 1.0 / m - 1.0 / n), EPS0 * v["eps_r"] / v["d"]
+    x = np.sqrt(per_volt * (n * n / (n - m)) * v["beta"] ** (1.0 / n) * v["alpha"] ** (-1.0 / m)) * area**p / v["fn"]
+    return x, area
+
+
+def two_scales(u: FloatArray, v: Values) -> FloatArray:
+    """Eqs. 1 and 4 with friction in proportion to the real contact area, F_T = sqrt(pi/8) mu p_sat A_real.
+
+    A = A0 - (c2 / A0) F_T^2, and F_T grows with A, so that there is one root.
+    """
+    from fingerspice.physics.contact import universal_curve_array
+
+    x, at_rest = paper_constants(v)
+    m, n = float(np.max(v["m_exp"])), float(np.max(v["n_exp"]))
+    adhesive = at_rest * universal_curve_array(x * u, 1.0 / m, 0.5 * (1.0 + 1.0 / m - 1.0 / n))
+
+    def missing(a: FloatArray, most: FloatArray, s: FloatArray, load: FloatArray, c: FloatArray, p: FloatArray) -> Any:
+        return a - most + c / most * (p * _real_area(load + s * a, a, p)) ** 2
+
+    loss = v["c2"] * (_FRICTION * np.asarray(v["mu"])) ** 2
+    return root(missing, 1e-9 * adhesive, adhesive, adhesive, stress(u, v), v["fn"], loss, v["p_sat"])

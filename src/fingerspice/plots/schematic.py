@@ -158,7 +158,7 @@ _PARTS: dict[str, Symbol] = {
 def _symbol(element: Element) -> Symbol:
     if element.device in _PARTS:
         return _PARTS[element.device]
-    if element.device == "SKIN_DISPERSIVE":
+    if element.device in ("SKIN_DISPERSIVE", "CPE", "CPE_LAYER"):
         # Two cells stand for the many of the ladder, with dots in between.
         away = _HALF + 0.1
         dots: list[Stroke] = [[(0.0, y), (0.0, y + 0.02)] for y in (-0.06, -0.01, 0.04)]

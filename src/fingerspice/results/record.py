@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +16,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.network import Network
 from fingerspice.engine.network import Net
 from fingerspice.physics.contact import Contact, areas, forces, inverse_area_array
+from fingerspice.physics.laws import friction, real_area
 from fingerspice.waveforms.waveform import Waveform, require
 
 
@@ -43,6 +45,7 @@ SIGNALS = {
     "friction": Signal(
         "1", "friction coefficient f_t / f_n", "coefficient", "Friction coefficient", 1.0, True, "gap", True
     ),
+    "a_real": Signal("m^2", "real contact area", "real area", "Real area", of="gap", ripple=True),
     "q_source": Signal("C", "charge delivered by the source", "charge", "Charge", 2.0, of="source"),
     "i_source": Signal("A", "source current, regular part", "current", "Current", 2.0, of="source"),
     "fold_margin": Signal(
@@ -94,12 +97,21 @@ class Signals(Sealed):
 
     gaps = cached_property(lambda self: tuple(name for name, _ in self.fingers))  # Names of the GAPs
 
-    def _of_gaps(self, key: str, make: Callable[[Contact, FloatArray], FloatArray]) -> FloatArray | None:
-        return side_by_side([make(own[1], x) for own, x in zip(self.fingers, self.each(key), strict=True)])
+    _saturates = cached_property(lambda self: any(not math.isinf(contact.p_sat) for _, contact in self.fingers))
 
-    sigma_el = cached_property(lambda self: self._of_gaps("u_gap", Contact.stress))
-    f_t = cached_property(lambda self: self._of_gaps("f_el", lambda contact, f: contact.mu * (contact.f_n + f)))
-    friction = cached_property(lambda self: self._of_gaps("f_t", lambda contact, f: f / contact.f_n))
+    def _of_gaps(self, make: Callable[..., FloatArray], *keys: str) -> FloatArray | None:
+        """A signal of the GAPs by their contacts and signals."""
+        columns = zip((contact for _, contact in self.fingers), *map(self.each, keys), strict=True)
+        return side_by_side([make(*column) for column in columns])
+
+    sigma_el = cached_property(lambda self: self._of_gaps(Contact.stress, "u_gap"))
+    f_t = cached_property(lambda self: self._of_gaps(friction, "f_el", *(("area",) if self._saturates else ())))
+    friction = cached_property(lambda self: self._of_gaps(lambda contact, f: f / contact.f_n, "f_t"))
+
+    @cached_property
+    def a_real(self) -> FloatArray | None:
+        """Real contact area of each GAP, m^2; None where no GAP has a `p_sat`."""
+        return self._of_gaps(real_area, "f_el", "area") if self._saturates else None
 
     def each(self, key: str) -> Sequence[FloatArray]:
         """A signal of each of its elements, shape (n_t,); none where the run has no such signal."""
@@ -120,6 +132,8 @@ class Signals(Sealed):
             raise InputError(f"unknown signal {key!r}; allowed: {', '.join(SIGNALS)}")
         if colon:
             return (key,)
+        if key == "a_real" and not self._saturates:
+            return ()
         several = tuple(f"{key}:{name}" for name in self.columns(key))
         # Decide without computing the signal, where possible.
         if key in ("q_source", "i_source") or (SIGNALS[key].of == "gap" and not several):
@@ -189,6 +203,7 @@ class Signalled:
     )
     f_t: FloatArray | None = _given("f_t", "Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP.")
     friction: FloatArray | None = _given("friction", "Friction coefficient f_t / f_n; otherwise as `u_gap`.")
+    a_real: FloatArray | None = _given("a_real", "Real contact area, m^2, shape (n_t,); None without a ``p_sat``.")
 
     def by_name(self, key: str) -> dict[str, FloatArray]:
         """A signal by its name, or the columns of several elements by ``name:element``.

@@ -200,7 +200,7 @@ _WAVEFORMS = {
         periodic.Repeat, samples.Samples,
     )
 }  # fmt: skip
-_OF_CONTACT = ("d", "eps_r", "f_n", "mu")  # What the signals of a run need of a contact
+_OF_CONTACT = ("d", "eps_r", "f_n", "mu", "p_sat")  # What the signals of a run need of a contact
 _LEFT_OUT = ("where", "text", "path")  # Attributes of a circuit and its elements that a file does not hold here
 
 
@@ -330,7 +330,7 @@ def _solution(file: Any) -> Solution:
     t = table[:, 0].copy()
     if np.any(np.diff(t) < 0.0):
         raise ValueError("its times do not ascend")
-    fingers = tuple((str(name), Contact(*(values[k] for k in _OF_CONTACT))) for name, values in run["contacts"])
+    fingers = tuple((str(name), Contact(**values)) for name, values in run["contacts"])
     sources = tuple(map(str, run["sources"]))
     continuous = None
     if "between" in group.variables:

@@ -21,9 +21,10 @@ from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.outcome import ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import Sealed, Signalled, Signals, attribute, kept_rows, signal_of, variables
 from fingerspice.results.steps import Outputs, Stretch
+from fingerspice.waveforms.waveform import refuse
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     import pandas
     import xarray
@@ -37,13 +38,13 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.waveform import Fundamental
 
 
-DERIVED = ("u_gap", "area", "f_el", "f_t", "friction")  # Signals and means that have derivatives
-MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
+DERIVED = ("u_gap", "area", "f_el", "f_t", "friction", "a_real")  # Signals and means that have derivatives
+MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean", "a_real_mean")
 MOST_BETWEEN = 2_000_000  # Most numbers of the last period between the outputs that a file keeps (16 MB)
 # The signals in it, and how far they may be from their polynomials, relative to their peaks.
 _BETWEEN, _MISSED = ("u_source", "u_layer", "v", "u_gap", "area", "f_el", "fold_margin"), 1e-10
 #: Signals that have rows in the table, in their order, and its columns of figures: heading and kind.
-_ROWS = ("u_source", "u_gap", "u_layer", "v", "f_el", "f_t", "friction", "area")
+_ROWS = ("u_source", "u_gap", "u_layer", "v", "f_el", "f_t", "friction", "area", "a_real")
 _COLUMNS = {
     "min": "min", "max": "max", "mean": "mean", "last period": "mean_periodic", "rms": "rms_periodic",
     "ripple": "ripple",
@@ -61,10 +62,10 @@ class Sensitivity(Sealed):
         The parameter, as in `Circuit.parameters`, and its unit in the netlist.
     value : float
         Of the parameter, in that unit.
-    u_gap, area, f_el, f_t, friction : ndarray, shape (n_t,)
-        Derivatives of the signals of the same names at `Solution.t`.
-    f_el_mean, f_t_mean, friction_mean, area_mean : float
-        Derivatives of the means over the run, from TSTART to its end.
+    u_gap, area, f_el, f_t, friction, a_real : ndarray, shape (n_t,)
+        Derivatives of the signals of the same names at `Solution.t`; `a_real` is None without a ``p_sat``.
+    f_el_mean, f_t_mean, friction_mean, area_mean, a_real_mean : float
+        Derivatives of the means over the run, from TSTART to its end; `a_real_mean` likewise.
     """
 
     path: str
@@ -79,6 +80,8 @@ class Sensitivity(Sealed):
     f_t_mean: float
     friction_mean: float
     area_mean: float
+    a_real: FloatArray | None = None
+    a_real_mean: float | None = None
 
     def __repr__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
@@ -113,6 +116,14 @@ class SampleGradient(Sealed):
         return f"SampleGradient({self.source}: {told})"
 
 
+def check_signals(circuit: Circuit, names: Iterable[str], varied: Iterable[str] = ()) -> None:
+    """Refuse the real area, or its figures, among names where neither a GAP nor a parameter that varies is a p_sat."""
+    asked = [name for name in names if name.startswith("a_real")]
+    none = all(math.isinf(gap.values["p_sat"]) for gap in circuit.by_device("GAP"))
+    unknown = bool(asked) and none and not any(path.lower().endswith(".p_sat") for path in varied)
+    refuse(unknown, f"{', '.join(asked)} is asked for, and no GAP has a real area; allowed: with p_sat, as p_sat=300k")
+
+
 def figure(key: str, kind: str, doc: str) -> Value:
     """A property of a result that has a method `_figure`: a figure of a signal."""
     return attribute(lambda result: result._figure(key, kind), doc=doc)  # type: ignore[no-any-return]
@@ -131,6 +142,7 @@ class Figured:
     f_t_mean_periodic = figure("f_t", "mean_periodic", "Mean of `f_t` over the last period, N; None without one.")
     friction_mean = figure("friction", "mean", "Mean friction coefficient over the run.")
     area_mean = figure("area", "mean", "Mean ridge contact area over the run, m^2.")
+    a_real_mean = figure("a_real", "mean", "Mean real contact area over the run, m^2; None without a ``p_sat``.")
     u_gap_peak = figure("u_gap", "peak", "Largest modulus of the gap voltage, V.")
     u_gap_rms = figure("u_gap", "rms", "Root of the mean square of the gap voltage over the run, V.")
     u_gap_amplitude = figure(
@@ -145,7 +157,7 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
 
     Signals are read-only arrays in SI units, computed when they are first asked for. A jump of the source has two rows
     with the same time. Where a circuit has several GAPs, their signals (`u_gap`, `area`, `sigma_el`, `f_el`, `f_t`,
-    `friction`) have the shape (n_t, n_gap), in the order of `gaps`. In the same way `u_source`, `q_source` and
+    `friction`, `a_real`) have the shape (n_t, n_gap), in the order of `gaps`. Likewise `u_source`, `q_source` and
     `i_source` have a column for each of several sources, in the order of `sources`.
 
     Attributes
@@ -323,7 +335,7 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
     @cached_property
     def _shown(self) -> tuple[str, ...]:
         """Names of the signals in the summary: of gaps, or else of all layers, or else of all nodes."""
-        of_gaps = ("u_gap", "area", "f_el", "f_t", "friction")
+        of_gaps = ("u_gap", "area", "f_el", "f_t", "friction", "a_real")
         keys = of_gaps if self.gaps else ("u_layer" if self.layers else "v", "area")
         return tuple(name for key in ("u_source", *keys) for name in self.record.names(key))
 

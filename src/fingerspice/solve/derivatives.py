@@ -132,7 +132,8 @@ def sensitivities_of(
         said = f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period"
         refuse(math.isnan(longer), f"{said}; allowed: other parameters, or a run from another start")
         runs = one.runs(1.0, run, solution)
-        by: dict[str, Any] = {name: one.by([getattr(other, name) for other in runs]) for name in (*DERIVED, *MEANS)}
+        known = [name for name in (*DERIVED, *MEANS) if getattr(solution, name) is not None]
+        by: dict[str, Any] = {name: one.by([getattr(other, name) for other in runs]) for name in known}
         for share in _CLOSER:
             # The area has a kink where the gap voltage is 0.
             signs = np.sign([np.reshape(np.asarray(other.u_gap), (other.t.size, -1)) for other in runs])
@@ -140,9 +141,9 @@ def sensitivities_of(
             if not turned.any():
                 break
             runs = one.runs(share, run, solution)
-            for name in DERIVED:
+            for name in by.keys() & DERIVED:
                 by[name][turned] = one.by([getattr(other, name)[turned] for other in runs], share)
-        for name in MEANS if over_period else ():
+        for name in by.keys() & MEANS if over_period else ():
             # The mean over a period that grows takes up what the signal is at its end.
             at_end = getattr(solution, name.removesuffix("_mean"))[-1]
             by[name] = by[name] + longer * (at_end - getattr(solution, name))
@@ -152,18 +153,20 @@ def sensitivities_of(
 
 def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """The number's derivatives by u_gap, force and area at the outputs, shape (n_t,), and by the latter's means."""
-    allowed = ", ".join((*DERIVED, *MEANS))
+    ((_, contact),) = run.record.fingers
+    # With a p_sat friction is no longer in proportion to the force.
+    left_out = ("a_real",) if math.isinf(contact.p_sat) else ("a_real", "f_t", "friction")
+    allowed = ", ".join(name for name in (*DERIVED, *MEANS) if not name.startswith(left_out))
     refuse(not of, f"no signal is given; allowed: {allowed}")
     by: dict[str, Any] = dict.fromkeys(DERIVED, np.zeros(run.t.size)) | dict.fromkeys(MEANS, 0.0)
     for name, given in of.items():
-        refuse(name not in by, f"unknown signal {name!r}; allowed: {allowed}")
+        refuse(name not in allowed.split(", "), f"unknown signal {name!r}; allowed: {allowed}")
         value = real_numbers(name, given, "numbers, derivatives by the signal")
         shape, finite = () if name in MEANS else run.t.shape, bool(np.isfinite(value).all())
         if value.shape != shape or not finite:
             said = f"{name} has the shape {value.shape}{'' if finite else ' and numbers that are not finite'}"
             raise InputError(f"{said}; allowed: the shape {shape}, finite: the derivative of a number by that signal")
         by[name] = value
-    ((_, contact),) = run.record.fingers
     # F_t = mu (F_N + F_el), and the friction coefficient is F_t / F_N.
     for kind in ("", "_mean"):
         by[f"f_el{kind}"] = by[f"f_el{kind}"] + contact.mu * (by[f"f_t{kind}"] + by[f"friction{kind}"] / contact.f_n)

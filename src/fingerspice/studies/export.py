@@ -12,8 +12,9 @@ import numpy as np
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import require_circuit
+from fingerspice.circuit.laws import acting_law
 from fingerspice.circuit.network import network_of
-from fingerspice.circuit.statespace import find_branches
+from fingerspice.circuit.statespace import beside_gap, find_branches
 from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from fingerspice.physics.contact import Contact, JkrContact, LawContact
 from fingerspice.solve.problem import prepare
@@ -76,8 +77,9 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
         changed = ", ".join(f"{k} = {v}" for k, v in circuit.overrides.items())
         lines.append(f"* Changed from the deck: {' '.join(changed.split())}"[:1000])
     for element in circuit.elements:
-        text = _element_line(element, circuit, ratio, areas)
-        lines += textwrap.wrap(text, 100, subsequent_indent="+ ", break_long_words=False, break_on_hyphens=False)
+        for one in filter(None, (element, beside_gap(element))):
+            text = _element_line(one, circuit, ratio, areas)
+            lines += textwrap.wrap(text, 100, subsequent_indent="+ ", break_long_words=False, break_on_hyphens=False)
     if (tran := circuit.tran) is not None:
         more = (tran.start, tran.max_step) if tran.max_step else (tran.start,) if tran.start else ()
         lines.append(f".tran {' '.join(map(repr, (tran.step, tran.stop, *more)))}{' uic' if tran.uic else ''}")
@@ -173,18 +175,20 @@ def _element_line(element: Element, circuit: Circuit, work_ratio: float, start_a
     if element.waveform is not None:
         ac = "" if element.ac is None else f" AC {float(element.ac.magnitude)!r} {float(element.ac.phase_deg)!r}"
         return f"{head} {_source_text(element.waveform, element.name, circuit)}{ac}"
-    if not element.spec.is_layer:
+    if element.spec.cells is None:
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
         return f"{head} {element.values['value']!r}{initial}"
-    # e_max is left out: it only serves a warning of this package.
-    written = [k for k in element.values if k != "e_max" and (element.law is None or k in _OF_TABLES)]
+    # e_max, p_sat, and the CPE beside a gap are left out: a warning, and friction, are of this package alone.
+    left_out = ("e_max", "p_sat", "q", "n_cpe") if element.device == "GAP" else ("e_max",)
+    tabled = element.device == "GAP" and acting_law(element) is not None
+    written = [k for k in element.values if (k in _OF_TABLES if tabled else k not in left_out)]
     numbers = {k: "1e30" if math.isinf(v := element.values[k]) else repr(float(v)) for k in written}
     values = " ".join(f"{k}={number}" for k, number in numbers.items())
     extra = f" wk={work_ratio!r}" if element.device == "GAP" and work_ratio != 1.0 else ""
-    area = start_areas.get(element.nodes[2])
-    held = 0.0 if area is None else start_voltage(element, circuit.initial)
-    extra += f" ic={held!r} a_ic={area!r}" if held else ""
-    device = element.device if element.law is None else f"GAP_{_element_name(element)}"
+    held = start_voltage(element, circuit.initial) if start_areas else 0.0
+    extra += f" ic={held!r}" if held else ""
+    extra += f" a_ic={start_areas[element.nodes[2]]!r}" if held and element.spec.is_layer else ""
+    device = f"GAP_{_element_name(element)}" if tabled else element.device
     return f"{head} {device} {values}{extra}"
 
 

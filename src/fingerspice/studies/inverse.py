@@ -65,6 +65,8 @@ class Finger:
         (self.gap,), (self.source,) = gaps, sources
         tau = self.gap.values["tau"]
         refuse(tau > 0.0, f"{self.gap.name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
+        p_sat = self.gap.values["p_sat"]
+        refuse(p_sat < math.inf, f"{self.gap.name} has p_sat={p_sat:g} Pa: friction saturates; allowed here: p_sat=inf")
         scene = linear_scene(circuit)
         self.network, self.contact, stack = scene.network, scene.contact, scene.network.stack
         self.area = scene.network.areas[scene.finger].given  # Fixed by the deck, m^2, or None

@@ -18,7 +18,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import own_path, require_circuit
 from fingerspice.results.outcome import SolveError
-from fingerspice.results.solution import DERIVED, MEANS, Solution
+from fingerspice.results.solution import DERIVED, MEANS, Solution, check_signals
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import LEAST_RTOL, REFUSED, batch
 from fingerspice.studies.batch.lockstep import lockstep_form, why_alone
@@ -52,6 +52,7 @@ class Runs(torch.nn.Module):
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in self.outputs:
             refuse(name not in MEANS + DERIVED, f"unknown output {name!r}; allowed: {', '.join(MEANS + DERIVED)}")
+        check_signals(circuit, self.outputs)
         require(bool(self.outputs), "outputs", "empty", "one or more names")
         require(len(set(self.outputs)) == len(self.outputs), "outputs", repr(self.outputs), "every name once")
         signals = [name for name in self.outputs if name in DERIVED]

@@ -21,7 +21,7 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.engine.lockstep.card import require_card
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
-from fingerspice.results.solution import DERIVED, MEANS
+from fingerspice.results.solution import DERIVED, MEANS, check_signals
 from fingerspice.solve.simulation import RTOL_RANGE, rtol_given, simulate
 from fingerspice.studies.batch.lockstep import LOCKSTEP, Ladder, LockstepForm, Slopes, lockstep_form, why_alone
 from fingerspice.studies.steady import steady_state
@@ -270,6 +270,7 @@ def batch(
             own_data = f"{element.name}.f"
             refuse(own_data in scenes, f"skin='follow' and {own_data} are both given; allowed: one of them")
             task.scenes[own_data] = frequency
+    check_signals(circuit, task.outputs, scenes)
     for text in scenes_warnings(circuit, task.t_stop, scenes, skin):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     slopes, form = gradients_of(task, gradients, skin), lockstep_form(circuit, task.scenes)

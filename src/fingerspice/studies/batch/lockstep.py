@@ -14,7 +14,7 @@ from numpy.polynomial import chebyshev as powers
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import Value
-from fingerspice.circuit.laws import ContactLaw
+from fingerspice.circuit.laws import ContactLaw, acting_law
 from fingerspice.circuit.statespace import Stack, build_stack, in_si, loop_of
 from fingerspice.engine.lockstep.card import march_on_card
 from fingerspice.engine.lockstep.march import N_PORTION, march
@@ -23,6 +23,7 @@ from fingerspice.engine.lockstep.step import ALL_MOMENTS, START_TIMES, marks_of
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.modes import STEP
 from fingerspice.physics.contact import universal_curve_array
+from fingerspice.physics.laws import paper_constants
 from fingerspice.physics.materials import EPS0
 from fingerspice.waveforms.periodic import Pulse, Square
 from fingerspice.waveforms.samples import Samples, as_samples
@@ -39,7 +40,7 @@ FIGURES: dict[str, tuple[int, ...]] = {
     "friction_rms": (0, 1), "u_gap_rms": (2,),
 }  # fmt: skip
 # Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
-_FORM = ("m_exp", "n_exp", "a_fix", "tau")
+_FORM = ("m_exp", "n_exp", "a_fix", "tau", "p_sat")
 # Most layers and most tones of a lockstep: code is compiled for each number of cells and of tones.
 _MOST_LAYERS, _MOST_TONES = 4, 4
 # Largest ratio of a tone's frequency to that of the whole source.
@@ -163,6 +164,8 @@ def why_alone(form: LockstepForm | str, outputs: Iterable[str], slopes_at: float
         return form
     if slopes_at is not None and form.recording is not None:
         return "the source is a recording"
+    if not math.isinf(form.gap.values["p_sat"]) and any(name.startswith(("f_t_", "friction_")) for name in outputs):
+        return "friction saturates (p_sat)"
     # Of a recording no last period is kept.
     suffix = "_periodic" if form.recording is None else ""
     others = [name for name in outputs if name != "u_gap" and name.removesuffix(suffix) not in FIGURES]
@@ -209,17 +212,15 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
         recorded = None if form.recording is None else [(0.0, peak_of(form.recording), 0.0)]
         for _, amplitude, phase in recorded or _tones_of(element.waveform, values(element))[0]:
             rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
-    if form.gap.law is None:
-        # As `JkrContact.packed`, for arrays of values: X at 1 V, A0, c2 mu^2
-        m, n, f_n, per_volt = v["m_exp"], v["n_exp"], np.asarray(v["fn"]), EPS0 * v["eps_r"] / v["d"]
-        area, p = v["alpha"] * f_n**m, 0.5 * (1.0 + 1.0 / m - 1.0 / n)
-        xi = np.sqrt(per_volt * (n * n / (n - m)) * v["beta"] ** (1.0 / n) * v["alpha"] ** (-1.0 / m)) * area**p / f_n
+    law = acting_law(form.gap)
+    if law is None:
+        xi, area = paper_constants(v)
         loss = v["c2"] * np.asarray(v["mu"]) ** 2
     else:
         peak = sum(np.hypot(along, across) for along, across in zip(rows[::2], rows[1::2], strict=True))
-        xi, of_law = _series_of(form.gap.law, v, np.broadcast_to(peak, count))
+        xi, of_law = _series_of(law, v, np.broadcast_to(peak, count))
         # At 0 V the variable is -1.
-        area, loss, rows = 1.0 / np.polyval(of_law, -1.0), 0.0, [*rows, *of_law]
+        area, loss, rows = np.asarray(1.0 / np.polyval(of_law, -1.0), float), 0.0, [*rows, *of_law]
     stress = 0.5 * EPS0 * v["eps_r"] / v["d"] ** 2
     rows[:0] = [xi, area, stress, v["fn"], loss, 2.0 * np.pi * np.asarray(frequency)]
     others, cell = CELL_ROWS * form.stack.c.size, 0
@@ -417,10 +418,8 @@ class Ladder:
     def _run(self, pending: IntArray, covered: float, steps: int, degree: int, before: Run | None) -> Run | None:
         """Integrate scenes, for half the steps, too, where `before` has no results; None: no curve."""
         task, form, halves, columns = self.task, self.form, self.halves, self._columns(pending)
-        own = form.gap.values
-        curves = (
-            (np.zeros(0), *_to_powers(degree)[:2]) if form.gap.law else curves_of(own["m_exp"], own["n_exp"], degree)
-        )
+        own, matrices = form.gap.values, _to_powers(degree)[:2]
+        curves = (np.zeros(0), *matrices) if acting_law(form.gap) else curves_of(own["m_exp"], own["n_exp"], degree)
         if curves is None:
             return None
         sizes, recorded = (steps // 2 if before is None else 0, steps), form.recording is not None

@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 #: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
-MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V", "impedance": "ohm"}
+MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "a_real": "m^2", "u_gap": "V", "impedance": "ohm"}
 #: The one measured quantity that is no mean, and the column that may stand beside it.
 IMPEDANCE, PHASE = "impedance", "impedance_phase"
-_MEANS = ("f_el", "f_t", "friction", "area")
+_MEANS = ("f_el", "f_t", "friction", "area", "a_real")
 _TIME = "t"
 _UNITS = MEASURED | {f"{signal}_mean": unit for signal, unit in MEASURED.items()} | {_TIME: "s", PHASE: "deg"}
 # Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's; and of the
@@ -354,9 +354,10 @@ def fit(
     circuit : Circuit
         With the values to start from.
     data : mapping of str to array_like, shape (n,), or path
-        Columns: the measured means (``f_el_mean``, ``f_t_mean``, ``friction_mean`` or ``area_mean``) and the conditions
+        Columns: the measured means (``f_el_mean``, ``f_t_mean``, ``friction_mean``, ``area_mean`` or, of a GAP with
+        ``p_sat``, ``a_real_mean``) and the conditions
         under which they were measured, as paths (``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``t``
-        and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``u_gap``); or ``frequency`` and
+        and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``a_real``, ``u_gap``); or ``frequency`` and
         ``impedance``, the magnitude (ohm) of what the source sees, with ``impedance_phase`` (deg) where it is known.
         ``sigma`` is the standard deviation of every value; where it is missing, it is estimated from the residuals, as
         equal shares of the values or, where that is clearly likelier, as equal for all (so, too, of signals over time,

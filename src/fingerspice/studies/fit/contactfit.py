@@ -327,6 +327,8 @@ def _gap(circuit: Circuit, finger: str | None) -> str:
     require(bool(name), "finger", repr(finger), f"the name of a GAP, {known}")
     law = circuit[name].law
     require(law is None, f"{name}.law", repr(law and law.name), "'jkr', whose parameters are fitted here")
+    p_sat = circuit[name].values["p_sat"]
+    require(math.isinf(p_sat), f"{name}.p_sat", f"{p_sat:g} Pa", "inf, as the contact's friction is mu times its load")
     fixed = circuit[name].values["a_fix"]
     require(fixed == 0.0, f"{name}.a_fix", f"{fixed:g} mm^2", "0, as a given area follows no contact")
     return name
