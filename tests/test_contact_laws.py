@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 import analytic as ref
 import fingerspice as fs
@@ -206,10 +207,77 @@ def test_the_real_area_is_saved_fitted_and_differentiated_and_needs_its_pressure
     ):
         with pytest.raises(fs.InputError, match="a_real_mean is asked for, and no GAP has a real area"):
             refused()
-    with pytest.raises(fs.InputError, match="Xgap has p_sat=300000 Pa: friction saturates"):
+    with pytest.raises(fs.InputError, match="Xgap has p_sat=300000 Pa, slip=0 m: friction"):
         fs.inverse_drive(circuit, friction=lambda t: 0.16 + 0 * t, rate=1e4)
     with pytest.raises(fs.InputError, match=r"Xgap\.p_sat is 300000 Pa"):
         fs.fit_contact(circuit, {"fn": [0.2, 0.5], "f_t": [0.06, 0.15]}, ["Xgap.mu"])
+
+
+def formed(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Friction of Table 1 at 100 Hz without a slip, from a run with many outputs."""
+    return fs.simulate(table1(), t_eval=t, rtol=1e-11).f_t
+
+
+SLIP, SPEED = 11.5e-6, 0.02
+
+
+def test_friction_with_a_slip_is_dahls_equation_at_any_time_and_speed() -> None:
+    fine = np.linspace(0.0, 0.02, 40001)
+    friction = CubicSpline(fine, formed(fine))
+    circuit = table1(gap={"slip": SLIP, "v": SPEED})
+    run = fs.simulate(circuit, t_eval=TIMES, rtol=1e-10)
+    speeds: list[Callable[[float], float]] = [lambda t: SPEED, lambda t: 0.03 + 0.02 * np.sin(40.0 * np.pi * t)]
+    runs = [run, run.slide(speeds[1])]
+    for speed, one in zip(speeds, runs, strict=True):
+        rate = lambda t, y, speed=speed: [speed(t) / SLIP * (friction(t) - y[0]), y[0]]  # noqa: E731
+        start = [friction(0.0), 0.0]
+        expected = solve_ivp(rate, (0.0, 0.02), start, "DOP853", TIMES, rtol=1e-11, atol=1e-13, max_step=1e-4)
+        np.testing.assert_allclose(one.f_t, expected.y[0], atol=2e-10)
+        np.testing.assert_allclose(one.friction, one.f_t / P.force_normal, rtol=1e-14)
+        np.testing.assert_array_equal(one.u_gap, run.u_gap)
+        means = fs.simulate(circuit, t_stop=0.02, rtol=1e-9).slide(speed), fs.simulate(table1(), t_stop=0.02)
+        assert means[0].f_t_mean == pytest.approx(expected.y[1, -1] / 0.02, rel=1e-8)
+        assert means[1].f_t_mean != pytest.approx(expected.y[1, -1] / 0.02, rel=1e-4)
+
+
+@pytest.mark.parametrize("speed", [0.005, 0.02, 0.1])
+def test_a_slip_is_a_first_order_low_pass_of_the_periodic_friction(speed: float) -> None:
+    plain, slow = (fs.steady_state(table1(gap=gap), rtol=1e-9).solution for gap in ({}, {"slip": SLIP, "v": speed}))
+    lines = [run.spectrum("f_t", highest=1000.0) for run in (plain, slow)]
+    strong = lines[0].amplitude > 1e-7
+    # 13.8 Hz for each mm/s.
+    cutoff = speed / (2.0 * np.pi * SLIP)
+    gain = 1.0 / np.sqrt(1.0 + (lines[0].frequency / cutoff) ** 2)
+    np.testing.assert_allclose(lines[1].amplitude[strong], (gain * lines[0].amplitude)[strong], rtol=1e-6)
+    assert slow.f_t_mean == pytest.approx(plain.f_t_mean, rel=1e-12)
+    assert slow.f_t[0] == pytest.approx(slow.f_t[-1], rel=1e-10)
+
+
+def test_a_slip_holds_for_networks_files_and_long_runs_and_is_refused_where_it_cannot(tmp_path: Path) -> None:
+    lines = [*finger("drive", "0", "area1", "1", f=100.0), *finger("drive", "0", "area2", "2", f=100.0)]
+    two = deck("Vdrive drive 0 SIN(0 200 100)", *lines, ".tran 0.2m 20m uic")
+    both = fs.simulate(two.replace({"Xgap1.slip": SLIP, "Xgap1.v": SPEED}), t_eval=TIMES, rtol=1e-9)
+    alone = fs.simulate(table1(gap={"slip": SLIP, "v": SPEED}), t_eval=TIMES, rtol=1e-9)
+    np.testing.assert_allclose(both.f_t[:, 0], alone.f_t, rtol=1e-7)
+    np.testing.assert_allclose(both.f_t[:, 1], fs.simulate(table1(), t_eval=TIMES, rtol=1e-9).f_t, rtol=1e-7)
+    alone.to_netcdf(tmp_path / "run.nc")
+    np.testing.assert_array_equal(fs.load(tmp_path / "run.nc").f_t, alone.f_t)
+    # Most periods of a long run are not integrated one by one, and its friction is that of every one of them.
+    circuit = table1(gap={"slip": 1e-3, "v": 1e-3})
+    long = fs.simulate(circuit, t_stop=3.0, t_eval=np.array([0.0, 3.0]))
+    settled = fs.steady_state(circuit).solution.f_t[-1]
+    begun = fs.simulate(circuit, t_stop=1.0, t_eval=np.array([0.0, 1.0])).f_t[-1]
+    assert (long.f_t[-1] - settled) / (begun - settled) == pytest.approx(np.exp(-2.0), rel=1e-4)
+    for refused, said in (
+        (lambda: next(fs.stream(circuit)), "needs the run between its outputs"),
+        (lambda: fs.simulate(table1()).slide(0.02), "no GAP has a slip"),
+        (lambda: alone.slide(-0.02), r"the speed of f_t is -0\.02 m/s"),
+        (lambda: table1(gap={"slip": SLIP}), "has slip and no v; allowed: v above 0"),
+        (lambda: fs.inverse_drive(circuit, friction=lambda t: 0.16 + 0 * t, rate=1e4), "slip=0.001 m: friction"),
+        (lambda: fs.load(tmp_path / "run.nc").slide(0.1), "needs the run between its outputs"),
+    ):
+        with pytest.raises(fs.InputError, match=said):
+            refused()
 
 
 def test_ngspice_agrees_with_a_saturating_contact_and_refuses_it_without_its_areas() -> None:
@@ -224,7 +292,7 @@ def test_a_file_keeps_the_law_and_the_figures(tmp_path: Path) -> None:
     solution = fs.simulate(table1().replace(OWN))
     solution.to_netcdf(tmp_path / "run.nc")
     loaded = fs.load(tmp_path / "run.nc")
-    assert loaded.circuit["Xgap"].law is LAW
+    assert loaded.circuit["Xgap"].law.name == "pulled"
     assert loaded.circuit["Xgap"].values["k"] == 60e-6
     np.testing.assert_array_equal(loaded.f_t, solution.f_t)
 

@@ -194,7 +194,7 @@ def _device(name: str, parameters: Iterable[dict[str, Any]] = (), **given: Any) 
 
 DEVICES = {one["name"]: _device(**one) for one in _DATA["device"]}  #: Every device that the reader knows, by name.
 #: Parameters of GAP that do not belong to the paper's contact law.
-OF_EVERY_LAW = ("d", "eps_r", "r", "fn", "mu", "a_fix", "tau", "p_sat", "q", "n_cpe")
+OF_EVERY_LAW = ("d", "eps_r", "r", "fn", "mu", "a_fix", "tau", "p_sat", "slip", "v", "q", "n_cpe")
 
 
 def called_devices() -> tuple[str, ...]:
@@ -276,8 +276,9 @@ def _check_element(element: Element) -> None:
         if not spec.accepts(v[spec.name]):
             given = f"{v[spec.name]:g} {spec.unit}".rstrip()
             raise InputError(f"{element.name} {spec.name} is {given}; allowed: {spec.allowed()}", element.where)
-    if element.device == "GAP" and v["q"] > 0.0 and v["n_cpe"] == 0.0:
-        raise InputError(f"{element.name} has q and no n_cpe; allowed: n_cpe between 0 and 1", element.where)
+    for name, other, allowed in (("q", "n_cpe", "n_cpe between 0 and 1"), ("slip", "v", "v above 0 m/s")):
+        if element.device == "GAP" and v[name] > 0.0 and v[other] == 0.0:
+            raise InputError(f"{element.name} has {name} and no {other}; allowed: {allowed}", element.where)
     if element.device != "GAP" or element.law is not None:
         return
     m, n, fault = v["m_exp"], v["n_exp"], ""

@@ -86,6 +86,10 @@ def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray | Non
     return read_only(np.column_stack([*columns]))
 
 
+#: Friction (N) of each GAP as a function of times (s); None of one without a slip.
+Frictions = tuple[Callable[[FloatArray], FloatArray] | None, ...]
+
+
 class Signals(Sealed):
     """Outputs of a run, with signals by name, each computed when it is first asked for; shapes as in `Solution`."""
 
@@ -94,6 +98,7 @@ class Signals(Sealed):
     fingers: tuple[tuple[str, Contact], ...]  # Each GAP's name and contact
     layers: tuple[str, ...]  # Names of the layers, in the order of `u_layer`
     node_voltages: dict[str, FloatArray]
+    slides: Frictions = ()
 
     gaps = cached_property(lambda self: tuple(name for name, _ in self.fingers))  # Names of the GAPs
 
@@ -105,8 +110,16 @@ class Signals(Sealed):
         return side_by_side([make(*column) for column in columns])
 
     sigma_el = cached_property(lambda self: self._of_gaps(Contact.stress, "u_gap"))
-    f_t = cached_property(lambda self: self._of_gaps(friction, "f_el", *(("area",) if self._saturates else ())))
     friction = cached_property(lambda self: self._of_gaps(lambda contact, f: f / contact.f_n, "f_t"))
+
+    @cached_property
+    def f_t(self) -> FloatArray | None:
+        """Friction force of each GAP, N; with a slip that of `fingerspice.results.slide`."""
+        formed = self._of_gaps(friction, "f_el", *(("area",) if self._saturates else ()))
+        if formed is None or not any(self.slides):
+            return formed
+        columns = (formed,) if formed.ndim == 1 else formed.T
+        return side_by_side([x if f is None else f(self.t) for x, f in zip(columns, self.slides, strict=True)])
 
     @cached_property
     def a_real(self) -> FloatArray | None:
@@ -276,6 +289,7 @@ class Record(Signals):
     # and without it the columns of the charges may be missing
     rows: FloatArray
     has_charge: bool = False
+    slides: Frictions = ()
 
     fingers = cached_property(lambda self: self.network.named_contacts)
     layers = cached_property(lambda self: tuple(e.name for e in self.network.layers))

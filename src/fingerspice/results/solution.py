@@ -21,10 +21,10 @@ from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.outcome import ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import Sealed, Signalled, Signals, attribute, kept_rows, signal_of, variables
 from fingerspice.results.steps import Outputs, Stretch
-from fingerspice.waveforms.waveform import refuse
+from fingerspice.waveforms.waveform import as_waveform, refuse
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     import pandas
     import xarray
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
     from fingerspice.sets import Citation
-    from fingerspice.waveforms.waveform import Fundamental
+    from fingerspice.waveforms.waveform import Fundamental, Waveform
 
 
 DERIVED = ("u_gap", "area", "f_el", "f_t", "friction", "a_real")  # Signals and means that have derivatives
@@ -286,6 +286,20 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
         low, high = self.remember((name, span is self._whole), lambda: span.extremes(name))
         figures: dict[str, float] = {"min": low, "max": high, "peak": max(high, -low), "ripple": high - low}
         return figures[kind]
+
+    def slide(self, speed: Waveform | float | Callable[[float], float]) -> Solution:
+        """The same run with its fingers sliding at a speed: a waveform, a number or a function of time (s), in m/s.
+
+        Friction with a ``slip`` of the GAP follows at this speed in place of its ``v``: F_t' = (v / slip) (F_c - F_t).
+
+        Raises
+        ------
+        InputError
+            If no GAP has a slip, the speed is below 0, or the run is not known between its outputs from its start on.
+        """
+        from fingerspice.results.slide import slid
+
+        return slid(self, as_waveform(speed))
 
     def _stretch(self, since: float, until: float) -> Stretch | None:
         """The run between two times (s); None where it is not known between its outputs."""

@@ -112,7 +112,7 @@ class Recorded(Remembering):
         fraction = self.times[3, :, None] * POINTS
         short = np.flatnonzero(self.times[3] != 1.0)
         if short.size:
-            columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], _basis(fraction[short]))
+            columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], basis(fraction[short]))
         return self._record(slice(None), fraction, columns.transpose(1, 0, 2))
 
     def _record(self, index: IntArray | slice, fraction: FloatArray, columns: FloatArray) -> tuple[FloatArray, Signals]:
@@ -142,7 +142,7 @@ class Recorded(Remembering):
         fraction = low * (1.0 - places) + high * places
 
         def make() -> tuple[FloatArray, Signals]:
-            return self._record(index, fraction, np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction)))
+            return self._record(index, fraction, np.einsum("pcn,pqn->cpq", self.values[index], basis(fraction)))
 
         # Signals are mostly asked for at the same places one after another.
         key = "places", index.tobytes(), fraction.tobytes()
@@ -156,7 +156,7 @@ def whole_steps(begin: FloatArray, end: FloatArray) -> FloatArray:
     return np.array([begin, end - begin, end, one, one, 0.0 * one])
 
 
-def _basis(fraction: FloatArray) -> FloatArray:
+def basis(fraction: FloatArray) -> FloatArray:
     """Weights (p, q, NODES) for interpolating values at the nodes to fractions (p, q) of a step."""
     distance = fraction[:, :, None] - POINTS[:NODES]
     hit = distance == 0.0
@@ -277,7 +277,8 @@ class Weighed:
         return complex(2j * (self.weight * np.exp(-2j * np.pi * frequency * self.t) * self.x).sum())
 
 
-def _halved(panels: Panels) -> Panels:
+def halved(panels: Panels) -> Panels:
+    """Both halves of panels."""
     step, low, high, duration = panels
     middle, half = 0.5 * (low + high), 0.5 * duration
     return np.concatenate([(step, low, middle, half), (step, middle, high, half)], axis=1)
@@ -298,7 +299,7 @@ class Stretch:
         """A signal with weights for its means, on panels as short as `longest` (s)."""
         panels = self.panels
         while (long := panels[3] > longest).any():
-            panels = np.concatenate([panels[:, ~long], _halved(panels[:, long])], axis=1)
+            panels = np.concatenate([panels[:, ~long], halved(panels[:, long])], axis=1)
         t, x = self.run.at_points(name, panels)
         error = missed(x) / (float(np.abs(x).max(initial=0.0)) or 1.0)
         share = panels[3] / panels[3].sum()
@@ -327,6 +328,10 @@ class Stretch:
         found = [self.run.at_points(name, panels) for name in names]
         return [x[:, :NODES] for x in (found[0][0], *(x for _, x in found))]
 
+    def resolved(self, name: str, tol: float) -> Panels:
+        """Panels on each of which a signal misses its polynomial by at most `tol` of its peak."""
+        return self._cut(name, tol, self.panels, np.finfo(float).eps * abs(self.span[1]) / tol)[1]
+
     def _cut(self, name: str, tol: float, panels: Panels, shortest: float = 0.0) -> tuple[Weighed, Panels]:
         """A signal, and panels on which its interpolation error is at most `tol` of its peak, or as short as told."""
         parts = []
@@ -339,7 +344,7 @@ class Stretch:
             parts.append((panels[:, ~wrong].T, t[~wrong, :NODES], x[~wrong, :NODES]))
             if not wrong.any():
                 break
-            panels = _halved(panels[:, wrong])
+            panels = halved(panels[:, wrong])
             t, x = self.run.at_points(name, panels)
             most -= len(t)
         every, t, x = map(np.concatenate, zip(*parts, strict=True))

@@ -154,8 +154,9 @@ def sensitivities_of(
 def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """The number's derivatives by u_gap, force and area at the outputs, shape (n_t,), and by the latter's means."""
     ((_, contact),) = run.record.fingers
-    # With a p_sat friction is no longer in proportion to the force.
-    left_out = ("a_real",) if math.isinf(contact.p_sat) else ("a_real", "f_t", "friction")
+    # With a p_sat or a slip friction is no longer in proportion to the force.
+    plain = math.isinf(contact.p_sat) and not any(run.record.slides)
+    left_out = ("a_real",) if plain else ("a_real", "f_t", "friction")
     allowed = ", ".join(name for name in (*DERIVED, *MEANS) if not name.startswith(left_out))
     refuse(not of, f"no signal is given; allowed: {allowed}")
     by: dict[str, Any] = dict.fromkeys(DERIVED, np.zeros(run.t.size)) | dict.fromkeys(MEANS, 0.0)

@@ -20,6 +20,7 @@ from fingerspice.circuit.describe import Parameters, Sources, circuit_warnings, 
 from fingerspice.physics.contact import inverse_area_range
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
+from fingerspice.results.slide import slid
 from fingerspice.results.solution import Solution
 from fingerspice.solve.closed_form import lead_to_fold, run_to_fold, solve_linear
 from fingerspice.solve.collocation import solve as solve_exponential
@@ -337,7 +338,7 @@ def solution_of(
     scene = problem.scene
     failure = None if run.status is Status.SUCCESS else run_failure(problem, run, record)
     fundamental = scene.network.waveform.fundamental if len(scene.network.waveforms) == 1 else None
-    return Solution(
+    found = Solution(
         t=t, record=record, status=run.status, failure=failure, nfev=run.nfev, stats=dict(run.stats), error=run.error,
         rtol=rtol, charge_law=scene.charge_law, area_mode=scene.area_mode, method=name, plan=plan,
         circuit=problem.circuit, state=run.state, fold_margin_min=run.margin, fundamental=fundamental,
@@ -345,6 +346,8 @@ def solution_of(
         first=max(problem.first, problem.t_start), t_stop=problem.t_stop, start=problem.start,
         continuous=run.continuous if run.t_failed is None else None,
     )  # fmt: skip
+    slips = failure is None and any(gap.values["slip"] > 0.0 for gap in problem.circuit.by_device("GAP"))
+    return slid(found) if slips else found
 
 
 def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | None) -> tuple[Run, str]:

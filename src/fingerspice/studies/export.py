@@ -178,8 +178,8 @@ def _element_line(element: Element, circuit: Circuit, work_ratio: float, start_a
     if element.spec.cells is None:
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
         return f"{head} {element.values['value']!r}{initial}"
-    # e_max, p_sat, and the CPE beside a gap are left out: a warning, and friction, are of this package alone.
-    left_out = ("e_max", "p_sat", "q", "n_cpe") if element.device == "GAP" else ("e_max",)
+    # Left out are what only a warning or the friction needs, and a CPE beside a gap, which is written for itself.
+    left_out = ("p_sat", "slip", "v", "q", "n_cpe") if element.device == "GAP" else ("e_max",)
     tabled = element.device == "GAP" and acting_law(element) is not None
     written = [k for k in element.values if (k in _OF_TABLES if tabled else k not in left_out)]
     numbers = {k: "1e30" if math.isinf(v := element.values[k]) else repr(float(v)) for k in written}

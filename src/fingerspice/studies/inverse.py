@@ -65,8 +65,9 @@ class Finger:
         (self.gap,), (self.source,) = gaps, sources
         tau = self.gap.values["tau"]
         refuse(tau > 0.0, f"{self.gap.name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
-        p_sat = self.gap.values["p_sat"]
-        refuse(p_sat < math.inf, f"{self.gap.name} has p_sat={p_sat:g} Pa: friction saturates; allowed here: p_sat=inf")
+        p_sat, slip = (self.gap.values[name] for name in ("p_sat", "slip"))
+        said = f"{self.gap.name} has p_sat={p_sat:g} Pa, slip={slip:g} m"
+        refuse(p_sat < math.inf or slip > 0.0, f"{said}: friction is not mu times its load; allowed here: inf and 0")
         scene = linear_scene(circuit)
         self.network, self.contact, stack = scene.network, scene.contact, scene.network.stack
         self.area = scene.network.areas[scene.finger].given  # Fixed by the deck, m^2, or None

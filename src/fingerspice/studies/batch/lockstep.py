@@ -40,7 +40,7 @@ FIGURES: dict[str, tuple[int, ...]] = {
     "friction_rms": (0, 1), "u_gap_rms": (2,),
 }  # fmt: skip
 # Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
-_FORM = ("m_exp", "n_exp", "a_fix", "tau", "p_sat")
+_FORM = ("m_exp", "n_exp", "a_fix", "tau", "p_sat", "slip", "v", "q", "n_cpe")
 # Most layers and most tones of a lockstep: code is compiled for each number of cells and of tones.
 _MOST_LAYERS, _MOST_TONES = 4, 4
 # Largest ratio of a tone's frequency to that of the whole source.
@@ -164,8 +164,9 @@ def why_alone(form: LockstepForm | str, outputs: Iterable[str], slopes_at: float
         return form
     if slopes_at is not None and form.recording is not None:
         return "the source is a recording"
-    if not math.isinf(form.gap.values["p_sat"]) and any(name.startswith(("f_t_", "friction_")) for name in outputs):
-        return "friction saturates (p_sat)"
+    follows = math.isinf(form.gap.values["p_sat"]) and form.gap.values["slip"] == 0.0
+    if not follows and any(name.startswith(("f_t_", "friction_")) for name in outputs):
+        return "friction is not mu times its load (p_sat, slip)"
     # Of a recording no last period is kept.
     suffix = "_periodic" if form.recording is None else ""
     others = [name for name in outputs if name != "u_gap" and name.removesuffix(suffix) not in FIGURES]
