@@ -19,10 +19,10 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along. Contact laws raised them, by at most 1,200.
-ALL_LINES = 35_149
+ALL_LINES = 35_148
 ALL_FILES = 130
 PACKAGE_LINES = {
-    "base": 1_028, "circuit": 2_247, "cli": 1_443, "engine": 7_171, "explorer": 1_168, "netlist": 2_034,
+    "base": 1_028, "circuit": 2_246, "cli": 1_443, "engine": 7_171, "explorer": 1_168, "netlist": 2_034,
     "numerics": 1_170, "physics": 689, "plots": 1_195, "results": 2_544, "sets": 361, "solve": 5_353,
     "studies": 5_983, "torch": 374, "waveforms": 2_239,
 }  # fmt: skip

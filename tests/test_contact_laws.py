@@ -268,11 +268,13 @@ def test_a_slip_holds_for_networks_files_and_long_runs_and_is_refused_where_it_c
     settled = fs.steady_state(circuit).solution.f_t[-1]
     begun = fs.simulate(circuit, t_stop=1.0, t_eval=np.array([0.0, 1.0])).f_t[-1]
     assert (long.f_t[-1] - settled) / (begun - settled) == pytest.approx(np.exp(-2.0), rel=1e-4)
+    with pytest.warns(fs.FingerspiceWarning, match="Xgap has a slip and v=0: a finger at rest"):
+        rest = fs.simulate(table1().replace({"Xgap.slip": SLIP}))
+    np.testing.assert_allclose(rest.f_t, 0.3 * 0.5, rtol=1e-12)
     for refused, said in (
         (lambda: next(fs.stream(circuit)), "needs the run between its outputs"),
         (lambda: fs.simulate(table1()).slide(0.02), "no GAP has a slip"),
         (lambda: alone.slide(-0.02), r"the speed of f_t is -0\.02 m/s"),
-        (lambda: table1(gap={"slip": SLIP}), "has slip and no v; allowed: v above 0"),
         (lambda: fs.inverse_drive(circuit, friction=lambda t: 0.16 + 0 * t, rate=1e4), "slip=0.001 m: friction"),
         (lambda: fs.load(tmp_path / "run.nc").slide(0.1), "needs the run between its outputs"),
     ):

@@ -266,7 +266,6 @@ def test_the_exponent_of_a_gaps_element_is_fitted_to_impedances() -> None:
         ("Xq a 0 CPE q=0 n_cpe=0.5", "Xq q is 0 S s.n; allowed: more than 0"),
         ("Xq a 0 CPE q=1n", "Xq: CPE needs n_cpe, missing here"),
         ("Xq a 0 area CPE q=1n n_cpe=0.5", r"Xq: CPE has 2 nodes \(p n\), 3 given"),
-        ("Xq a 0 area GAP q=1n", "Xq has q and no n_cpe; allowed: n_cpe between 0 and 1"),
     ],
 )
 def test_a_constant_phase_elements_range_is_told_at_its_call(line: str, said: str) -> None:
