@@ -450,3 +450,41 @@ def test_sigma_in_percent_is_a_share_of_every_value(circuit, data, tmp_path):
     (tmp_path / "b.csv").write_text("Vdrive.amplitude (V),friction_mean (%),sigma (%)\n100,31,0.5\n200,36,0.5\n")
     found = fs.fit(circuit, tmp_path / "b.csv", ["Xgap.d"], starts=1, rtol=1e-4)
     np.testing.assert_allclose(found.data.sigma, 0.005)
+
+
+def test_laws_are_compared_by_akaikes_criterion_or_said_not_to_be_told_apart() -> None:
+    """Areas of a contact law with noise: the criterion is that of the residuals, by hand."""
+    u = np.array([20.0, 60.0, 100.0, 140.0, 180.0, 220.0, 260.0])
+    true = table1(f=100.0).replace({"Xgap.law": "linear", "Xgap.slope": 60.0})
+    means = fs.batch(true, {"Vdrive.amplitude": u}, outputs=["area_mean"], periodic=True).area_mean.to_numpy()
+    noise = np.array([0.3, -0.5, 0.2, 0.6, -0.4, -0.1, 0.2]) * 1e-8
+    laws = {"dmt": ["Xgap.alpha"], "linear": ["Xgap.slope"], "jkr": ["Xgap.alpha"]}
+    found = fs.compare_laws(table1(f=100.0), {"Vdrive.amplitude": u, "area_mean": means + noise, "sigma": 4e-9}, laws)
+    assert (found.best, found.told_apart) == ("linear", True)
+    assert found.fits["linear"].estimates["Xgap.slope"].value == pytest.approx(60.0, rel=1e-3)
+    for name, one in found.fits.items():
+        chi2 = float((((means + noise) - one.predicted) ** 2).sum() / 4e-9**2)
+        assert found.aic[name] == pytest.approx(chi2 + 2.0 + 4.0 / 5.0, rel=1e-9)
+    assert sum(found.weights.values()) == pytest.approx(1.0)
+    assert "linear explains these data best of these laws." in str(found)
+    # At small voltages, and with errors as large as what the voltage does, no law is told from the others.
+    low = {"Vdrive.amplitude": u / 10.0, "area_mean": means[0] * (1.0 + noise * 2e6)}
+    close = fs.compare_laws(table1(f=100.0), low, {"dmt": ["Xgap.alpha"], "linear": ["Xgap.slope"]})
+    assert not close.told_apart
+    assert "but they do not tell it from" in str(close)
+    assert close.to_dict()["best"] == close.best
+
+
+@pytest.mark.parametrize(
+    ("laws", "count", "said"),
+    [
+        ({"dmt": ["Xgap.alpha"]}, 7, "1 laws are given; allowed: two or more"),
+        ({"dmt": ["Xgap.alpha"], "dmd": ["Xgap.alpha"]}, 7, "contact law is 'dmd'"),
+        ({"dmt": ["Xgap.slope"], "jkr": ["Xgap.alpha"]}, 7, "Xgap.slope"),
+        ({"dmt": ["Xgap.alpha"], "jkr": ["Xgap.alpha"]}, 3, "3 data are too few to judge .* with 2 numbers to find"),
+    ],
+)
+def test_wrong_comparisons_of_laws_are_refused(laws: dict[str, list[str]], count: int, said: str) -> None:
+    data = {"Vdrive.amplitude": np.linspace(20.0, 100.0, count), "area_mean": np.linspace(35.0, 35.2, count) * 1e-6}
+    with pytest.raises(fs.InputError, match=said):
+        fs.compare_laws(table1(), data, laws)

@@ -12,7 +12,7 @@ import fingerspice as fs
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.studies.fit.materialfit import read_table
 from ngspice_tools import run_ngspice
-from scenes import cases, deck, finger, listed
+from scenes import cases, deck, finger, listed, table1
 
 CUBIC, PRINTED, QUARTIC = (3, 2, 1), (3, 3, 2), (4, 3, 2)
 F = np.logspace(1.0, 5.0, 81)
@@ -256,6 +256,43 @@ def test_the_exponent_of_a_gaps_element_is_fitted_to_impedances() -> None:
     found = fs.fit(true.replace({"Xgap.q": 1e-6, "Xgap.n_cpe": 0.4}), data, ["Xgap.q", "Xgap.n_cpe"], skin="follow")
     assert found.estimates["Xgap.q"].value == pytest.approx(0.28e-6, rel=1e-4)
     assert found.estimates["Xgap.n_cpe"].value == pytest.approx(0.2, rel=1e-4)
+
+
+def test_sliding_and_standing_impedances_are_fitted_at_once_from_their_parts(tmp_path: Path) -> None:
+    source = "Vdrive drive 0 SIN(0 20 100)"
+    plain = deck(source, *finger("drive", "0", f=100.0), ".tran 0.1m 20m uic")
+    true = plain.replace({"Xgap.q": 0.1e-6, "Xgap.n_cpe": 0.3, "Xskin.d": 250e-6})
+    f, rows = np.geomspace(30.0, 1e4, 12), ["state,frequency (kHz),impedance_re (kohm),impedance_im (kohm)"]
+    for state, r in (("sliding", 2e6), ("standing", 5e3)):
+        z = fs.phasor(true.replace({"Xgap.r": r}), f).impedance
+        rows += [
+            f"{state},{1e-3 * x:.17g},{1e-3 * y.real:.17g},{1e-3 * y.imag:.17g}" for x, y in zip(f, z, strict=True)
+        ]
+    (tmp_path / "both.csv").write_text("\n".join(rows))
+    names = ["Xgap.r", "Xskin.d"]
+    found = fs.fit(true.replace({"Xgap.r": 1e6, "Xskin.d": 350e-6}), tmp_path / "both.csv", names,
+                   groups={"state": ["Xgap.r"]}, skin="follow")  # fmt: skip
+    assert found.estimates["Xgap.r[sliding]"].value == pytest.approx(2e6, rel=1e-4)
+    assert found.estimates["Xgap.r[standing]"].value == pytest.approx(5e3, rel=1e-4)
+    assert found.estimates["Xskin.d"].value == pytest.approx(250e-6, rel=1e-4)
+    for columns in ({"impedance_re": [1e5]}, {"impedance_re": [1e5], "impedance_im": [-1e5], "impedance": [2e5]}):
+        with pytest.raises(fs.InputError, match="allowed: both impedance_re and impedance_im, without impedance"):
+            fs.fit(plain, {"frequency": [100.0], **columns}, ["Xgap.r"])
+
+
+def test_impedances_are_drawn_as_bode_and_nyquist() -> None:
+    sliding, standing = (fs.phasor(table1().replace({"Xgap.r": r}), np.geomspace(10.0, 1e5, 81)) for r in (1e6, 1.0))
+    figure = sliding.plot_impedance("sliding", standing=standing)
+    size, phase, plane = figure.axes
+    for k, sweep in enumerate((sliding, standing)):
+        x, y = plane.lines[2 * k].get_data()
+        scale = 1e-6
+        np.testing.assert_allclose(x - 1j * y, scale * sweep.impedance)
+        np.testing.assert_allclose(size.lines[k].get_ydata(), scale * np.abs(sweep.impedance))
+        np.testing.assert_allclose(phase.lines[k].get_ydata(), np.degrees(np.angle(sweep.impedance)))
+    assert (size.get_ylabel(), plane.get_xlabel(), phase.get_xlabel()) == ("|Z| [MΩ]", "Re Z [MΩ]", "Frequency [Hz]")
+    with pytest.raises(fs.InputError, match=r"has no impedance; allowed: fs\.phasor of a circuit"):
+        fs.large_signal(table1(), [100.0], [20.0])[0].plot_impedance()
 
 
 @pytest.mark.parametrize(

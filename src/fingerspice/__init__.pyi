@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from fingerspice.studies.fit.circuitfit import Fit as Fit
     from fingerspice.studies.fit.circuitfit import fit as fit
     from fingerspice.studies.fit.contactfit import ContactFit as ContactFit
+    from fingerspice.studies.fit.contactfit import compare_laws as compare_laws
     from fingerspice.studies.fit.contactfit import fit_contact as fit_contact
     from fingerspice.studies.fit.materialfit import ColeCole as ColeCole
     from fingerspice.studies.fit.materialfit import MaterialFit as MaterialFit

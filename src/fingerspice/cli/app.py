@@ -148,6 +148,7 @@ def ac(
     amplitude: Annotated[list[float] | None, "With --area coupled: source amplitude in V; may be repeated."] = None,
     skin: Annotated[str, "SKIN's data: swept, at each frequency; own, at its f."] = "swept",
     finger: Annotated[str | None, "Which of several GAPs.", "GAP"] = None,
+    impedance: Annotated[bool, "Draw the impedance too, with that of gaps shorted as of a finger at rest."] = False,
 ) -> None:
     """Phasor sweep of DECK: gap voltage, phase, area and mean force against frequency.
 
@@ -157,6 +158,7 @@ def ac(
       fingerspice ac circuits/fingerpad.cir --sweep 'dec 10 10 100k' --out out
       fingerspice ac circuits/fingerpad.cir --area frozen --json
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
+      fingerspice ac circuits/fingerpad.cir --impedance
     """
     from fingerspice.circuit.circuit import AcSweep
     from fingerspice.circuit.describe import heading
@@ -185,7 +187,8 @@ def ac(
     found: tuple[Any, ...] = ()
     if not coupled:
         found = (fs.phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
-    job.check_files(circuit, "_ac.csv", "_ac.png")
+    drawn = ("_impedance.png",) if impedance else ()
+    job.check_files(circuit, "_ac.csv", "_ac.png", *drawn)
     if coupled:
         with paced("sweeping") as update:
             found = fs.large_signal(
@@ -193,7 +196,12 @@ def ac(
                 progress=update,
             )  # fmt: skip
     job.answer.update(sweeps=[r.to_dict() for r in found] if job.json else None)
-    makes: Makes = {"_ac.csv": partial(phasor_csv, found), "_ac.png": partial(plot_phasor, found, circuit)}
+    makes: dict[str, Any] = {"_ac.csv": partial(phasor_csv, found), "_ac.png": partial(plot_phasor, found, circuit)}
+    if drawn and not job.no_plot:
+        refuse(found[0].impedance is None, "--impedance: there is none of a large signal, or of several sources")
+        shorts = circuit.varied({f"{gap}.r": _SHORT for gap in gaps})
+        rest = {"gaps shorted": fs.phasor(shorts, frequencies, area="frozen", skin=skin, finger=finger)} if gaps else {}
+        makes["_impedance.png"] = partial(found[0].plot_impedance, "sliding" if gaps else "", **rest)
     job.give(lambda: "\n\n".join([heading(circuit), *(one._page(40) for one in found)]), makes)
 
 
@@ -357,13 +365,14 @@ def check(
     job.give(lambda: f"{store}: {sum(chunks.values()):,} chunks of {len(chunks)} arrays are as they were written")
 
 
+_SHORT = 1.0  # Resistance of a shorted gap, ohm
 _FILES = "deck out name overwrite"
 _END = "json no_plot"
 #: Every command with all its options, in the order of its help.
 _COMMANDS: dict[Callable[..., None], str] = {
     run: f"{_FILES} rtol charge_law area method set finger coating drive source stop start jumps csv "
     f"stream chunk signals netcdf feel schematic {_END}",
-    ac: f"{_FILES} sweep area amplitude skin finger charge_law rtol set source {_END}",
+    ac: f"{_FILES} sweep area amplitude skin finger impedance charge_law rtol set source {_END}",
     plan: "deck rtol charge_law area stop charge set source json",
     compare: f"{_FILES} rtol charge_law set source {_END}",
     studies.limits: f"{_FILES} points span capability limit carrier set source {_END}",

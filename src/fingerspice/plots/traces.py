@@ -12,6 +12,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
+from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import changes_text, drive_text, heading
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.plots import drawing
@@ -442,4 +443,37 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
         ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
     shaded = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
     drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, shaded) if p))
+    return figure
+
+
+def plot_impedance(results: Mapping[str, PhasorSolution]) -> Picture:
+    """Bode and Nyquist pictures of the impedances of named sweeps."""
+    figure, (size, phase, plane, unused) = drawing.new_figure(2, 2, height=4.9)
+    # The plane is as wide as the two others are side by side.
+    plane.set_subplotspec(unused.get_gridspec()[1, :])  # type: ignore[index]
+    unused.remove()
+    impedances = [np.asarray(r.impedance) for r in results.values()]
+    factor, unit = drawing.engineering(max(map(drawing.peak_of, map(np.abs, impedances))), "Ω", 0.5)
+    for number, ((name, r), z) in enumerate(zip(results.items(), impedances, strict=True)):
+        order = np.argsort(r.frequency)
+        f, z = r.frequency[order], z[order]
+        style: dict[str, Any] = {"color": drawing.CYCLE[number % 6], "linestyle": drawing.DASHES[number % 4]}
+        style |= {"linewidth": 1.5, "label": name}
+        size.plot(f, factor * np.abs(z), **style)
+        phase.plot(f, np.degrees(np.angle(z)), **style)
+        plane.plot(factor * z.real, -factor * z.imag, **style)
+        # Where the whole decades lie on the curve.
+        log, decades = np.log10(f), np.arange(np.ceil(np.log10(f[0]) - 1e-9), np.log10(f[-1]) + 1e-9)
+        x, y = (factor * np.interp(decades, log, part) for part in (z.real, -z.imag))
+        plane.plot(x, y, "o", color=style["color"], markersize=3.5)
+        for at in zip(decades.tolist(), x.tolist(), y.tolist(), strict=True) if number == 0 else ():
+            told: dict[str, Any] = {"fontsize": drawing.SMALL, "xytext": (4, 3), "textcoords": "offset points"}
+            plane.annotate(format_si(10.0 ** at[0], "Hz"), at[1:], **told)
+    drawing.dress(size, f"|Z| [{unit}]", "Frequency [Hz]", xscale="log", yscale="log")
+    drawing.dress(phase, "Phase of Z [°]", "Frequency [Hz]", xscale="log")
+    drawing.dress(plane, f"−Im Z [{unit}]", f"Re Z [{unit}]")
+    plane.set_aspect("equal", adjustable="box")
+    if len(results) > 1:
+        drawing.legend_above(size, 2)
+    drawing.caption(figure, heading(next(iter(results.values())).circuit))
     return figure

@@ -351,6 +351,23 @@ class PhasorSolution(Shown):
 
         return plot_phasor((self,), self.circuit)
 
+    def plot_impedance(self, name: str = "", **others: PhasorSolution) -> Figure:
+        """Bode and Nyquist pictures of the impedance, with those of other sweeps by their names.
+
+        ``sliding.plot_impedance("sliding", standing=standing)`` shows two states of a finger.
+
+        Raises
+        ------
+        InputError
+            If a sweep has no impedance: of a large signal, or of several sources.
+        """
+        from fingerspice.plots.traces import plot_impedance
+
+        sweeps = {name: self, **others}
+        missing = [one for one, sweep in sweeps.items() if sweep.impedance is None]
+        refuse(bool(missing), f"the sweep {missing} has no impedance; allowed: fs.phasor of a circuit with one source")
+        return plot_impedance(sweeps)
+
 
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     """Write sweeps as CSV, one after the other where there are several amplitudes."""

@@ -40,8 +40,9 @@ MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "a_real": "m
 #: The one measured quantity that is no mean, and the column that may stand beside it.
 IMPEDANCE, PHASE = "impedance", "impedance_phase"
 _MEANS = ("f_el", "f_t", "friction", "area", "a_real")
-_TIME = "t"
+_TIME, _PARTS = "t", ("impedance_re", "impedance_im")
 _UNITS = MEASURED | {f"{signal}_mean": unit for signal, unit in MEASURED.items()} | {_TIME: "s", PHASE: "deg"}
+_UNITS |= dict.fromkeys(_PARTS, "ohm")
 # Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's; and of the
 # means by which starts are compared.
 _SLOPES, _ROUGH = 1e-6, 1e-5
@@ -113,6 +114,11 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
         if by is not None or "no rows of numbers" not in refused.message:
             raise
         raise InputError(f"{refused.message}; allowed: numbers, and names in the column that groups names") from None
+    if columns.keys() & set(_PARTS):
+        said = f"{place} have a part of a complex impedance; allowed: both {' and '.join(_PARTS)}, without {IMPEDANCE}"
+        refuse(not columns.keys() >= set(_PARTS) or columns.keys() & {IMPEDANCE, PHASE}, said)
+        real, imaginary = (columns.pop(part) for part in _PARTS)
+        columns |= {IMPEDANCE: np.hypot(real, imaginary), PHASE: np.degrees(np.arctan2(imaginary, real))}
     names = {f"{name}_mean": name for name in _MEANS}
     names |= {name: name for name in MEASURED if name != IMPEDANCE} if _TIME in columns else {IMPEDANCE: IMPEDANCE}
     measured = [name for name in columns if name in names]
@@ -354,11 +360,11 @@ def fit(
     circuit : Circuit
         With the values to start from.
     data : mapping of str to array_like, shape (n,), or path
-        Columns: the measured means (``f_el_mean``, ``f_t_mean``, ``friction_mean``, ``area_mean`` or, of a GAP with
-        ``p_sat``, ``a_real_mean``) and the conditions
-        under which they were measured, as paths (``Vdrive.amplitude``, ``source.frequency``, ``Xgap.fn``); or ``t``
-        and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``a_real``, ``u_gap``); or ``frequency`` and
-        ``impedance``, the magnitude (ohm) of what the source sees, with ``impedance_phase`` (deg) where it is known.
+        Columns: the measured means (``f_el_mean``, ``f_t_mean``, ``friction_mean``, ``area_mean``, ``a_real_mean``) and
+        the conditions under which they were measured, as paths (``Vdrive.amplitude``, ``source.frequency``,
+        ``Xgap.fn``); or ``t`` and a signal over time (``f_el``, ``f_t``, ``friction``, ``area``, ``a_real``,
+        ``u_gap``); or ``frequency`` and what the source sees: ``impedance``, its magnitude (ohm), with
+        ``impedance_phase`` (deg) where it is known, or complex, or its parts ``impedance_re``, ``impedance_im`` (ohm).
         ``sigma`` is the standard deviation of every value; where it is missing, it is estimated from the residuals, as
         equal shares of the values or, where that is clearly likelier, as equal for all (so, too, of signals over time,
         and where hardly more data than parameters are given; of impedances always as equal shares). A table (CSV) has

@@ -1,4 +1,4 @@
-"""Fit of a GAP's contact to measured areas and friction forces: alpha, m, beta, n, mu and c2 with their intervals."""
+"""Fit of a GAP's contact to measured areas and friction forces, and contact laws compared by what they explain."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.pages import Page
+from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.devices import DEVICES
+from fingerspice.circuit.laws import ContactLaw
 from fingerspice.circuit.statespace import build_stack, contact_of, loop_of
 from fingerspice.physics.contact import JkrContact, ridge_area
+from fingerspice.studies.fit.circuitfit import Fit, fit
 from fingerspice.studies.fit.fitting import NOT_FOUND, SIGMA, FitResult, Fitted, Given, Problem, followed, measured_of
 from fingerspice.waveforms.waveform import refuse, require
 
@@ -404,3 +406,117 @@ def _errors(task: Task, best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray
         told = f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2."
         notes.append(f"{told} Measure the friction force.")
     return np.where(known, 1.0, math.inf), np.where(known, reach, math.inf), notes
+
+
+# Which law
+
+#: Laws whose criteria differ by less are not told apart (Burnham and Anderson 2002, section 2.6).
+NOT_TOLD_APART = 2.0
+
+
+@dataclass(frozen=True, repr=False)
+class LawComparison(Shown):
+    """Fits of one set of data under several contact laws.
+
+    Attributes
+    ----------
+    fits : dict of str to Fit
+        By the name of the law, the best first.
+    aic : dict of str to float
+        Akaike's criterion for few data (AICc) of each; the smallest belongs to the best law.
+    """
+
+    fits: dict[str, Fit]
+    aic: dict[str, float]
+
+    @property
+    def best(self) -> str:
+        """Name of the law with the smallest criterion."""
+        return next(iter(self.fits))
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Akaike weights: how likely each law is the best of them, of data like these."""
+        likely = np.exp(-0.5 * (np.array([*self.aic.values()]) - self.aic[self.best]))
+        return dict(zip(self.aic, (likely / likely.sum()).tolist(), strict=True))
+
+    @property
+    def told_apart(self) -> bool:
+        """Whether the data tell the best law from every other."""
+        return all(x - self.aic[self.best] >= NOT_TOLD_APART for name, x in self.aic.items() if name != self.best)
+
+    def _page(self) -> Page:
+        rows = [
+            (name, str(len(one.estimates)), f"{one._rms:.4g}", f"{self.aic[name] - self.aic[self.best]:.2f}",
+             f"{self.weights[name]:.2f}", ", ".join(f"{e.path} = {e.value:.4g}" for e in one.estimates.values()))
+            for name, one in self.fits.items()
+        ]  # fmt: skip
+        head = "law", "parameters", "rms residual", "AICc above the best", "weight", "fitted"
+        close = [x for x in self.fits if x != self.best and self.aic[x] - self.aic[self.best] < NOT_TOLD_APART]
+        said = f"{self.best} explains these data best"
+        said += f", but they do not tell it from {', '.join(close)}" if close else " of these laws"
+        return Page([f"{said}.", "", Table(head, rows)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The comparison as plain data, SI units."""
+        one = {"best": self.best, "aic": dict(self.aic), "weights": self.weights, "told_apart": self.told_apart}
+        return one | {"fits": {name: found.to_dict() for name, found in self.fits.items()}}
+
+
+def compare_laws(
+    circuit: Circuit, data: Given, laws: Mapping[str | ContactLaw, Sequence[str]], **how: Any
+) -> LawComparison:
+    """Fit data under several contact laws, and say which explains them best, or that the data cannot tell.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        With one GAP, and the values to start from.
+    data : mapping of str to array_like, shape (n,), or path
+        As of `fit`, but no impedances. Without ``sigma`` errors are taken as equal for all, or as equal shares of the
+        values, whichever is likelier, and the same for all laws.
+    laws : mapping of str or ContactLaw to sequence of str
+        The laws, and the paths of the parameters that are fitted under each.
+    **how
+        As of `fit`.
+
+    Returns
+    -------
+    LawComparison
+
+    Raises
+    ------
+    InputError
+        As `fit`; and for fewer than two laws, several GAPs, or data that are no more than a law's parameters and two.
+    """
+    require_circuit(circuit)
+    gaps = [gap.name for gap in circuit.by_device("GAP")]
+    refuse(len(gaps) != 1, f"laws are compared of one GAP; this circuit has {', '.join(gaps) or 'none'}")
+    refuse(len(laws) < 2, f"{len(laws)} laws are given; allowed: two or more, such as {{'jkr': [...], 'dmt': [...]}}")
+    fits = dict[str, Fit]()
+    for law, names in laws.items():
+        named = law.name if isinstance(law, ContactLaw) else law
+        fits[named] = fit(circuit.replace({f"{gaps[0]}.law": law}), data, names, **how)
+    refuse(any(one.data.signal == "impedance" for one in fits.values()), "laws are compared by means or signals")
+    values = next(iter(fits.values())).data.values
+    sizes = [np.full(values.size, 1.0), np.abs(values)] if np.all(values != 0.0) else [np.full(values.size, 1.0)]
+    found = [_criteria(fits, size) for size in sizes]
+    aic = min(found, key=lambda criteria: min(criteria.values()))
+    order = sorted(fits, key=aic.__getitem__)
+    return LawComparison({name: fits[name] for name in order}, {name: aic[name] for name in order})
+
+
+def _criteria(fits: Mapping[str, Fit], size: Any) -> dict[str, float]:
+    """AICc of fits whose errors, where they are not given, are in proportion to `size`."""
+    out = {}
+    for name, one in fits.items():
+        n, known = one.data.values.size, one.data.sigma
+        k = len(one.estimates) + (known is None)
+        refuse(
+            n - k - 1 < 1, f"{n} data are too few to judge {name} with {k} numbers to find; allowed: {k + 2} or more"
+        )
+        off = one.residual / (size if known is None else known)
+        deviance = n * math.log(float(np.mean(off**2)) or 1e-300) + 2.0 * float(np.log(size).sum())
+        deviance = float((off**2).sum()) if known is not None else deviance
+        out[name] = deviance + 2.0 * k + 2.0 * k * (k + 1.0) / (n - k - 1.0)
+    return out
