@@ -29,6 +29,7 @@ from fingerspice.circuit.devices import (
     unusual_of_changed,
 )
 from fingerspice.circuit.laws import ContactLaw, law_of
+from fingerspice.circuit.measures import Measure
 from fingerspice.waveforms.waveform import Waveform, as_waveform, refuse, require
 
 CHARGE_LAWS = ("local", "mobile")
@@ -155,6 +156,8 @@ class Circuit(Remembering, Shown):
         Changes made by `replace`, from path to value as text.
     sets : mapping of str to mapping
         Named sets of parameters that were applied, each with the values that it gave, by path.
+    measures : tuple of Measure
+        Of its `.meas` lines.
     related : Remembering
         Cache of results that depend on nodes and devices alone, shared by all circuits that `replace` derives.
     """
@@ -172,6 +175,7 @@ class Circuit(Remembering, Shown):
     path: Path | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    measures: tuple[Measure, ...] = ()
     related: Remembering = field(default_factory=Remembering, init=False, repr=False, compare=False)
 
     def _page(self) -> Page:

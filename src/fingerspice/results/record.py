@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +90,10 @@ def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray | Non
 Frictions = tuple[Callable[[FloatArray], FloatArray] | None, ...]
 
 
+#: The name of a signal, or a function of a record, shape (n_t,).
+Named = Union[str, "Callable[[Signals], FloatArray]"]
+
+
 class Signals(Sealed):
     """Outputs of a run, with signals by name, each computed when it is first asked for; shapes as in `Solution`."""
 
@@ -153,8 +157,10 @@ class Signals(Sealed):
             return () if getattr(self, key, None) is None else several if len(several) > 1 else (key,)
         return several if len(several) > 1 or key in ("u_layer", "v") else (key,)
 
-    def one(self, name: str) -> FloatArray:
-        """The signal of one of the `names`, shape (n_t,)."""
+    def one(self, name: Named) -> FloatArray:
+        """The signal of one of the `names`, or what a function makes of the record, shape (n_t,)."""
+        if callable(name):
+            return name(self)
         key, colon, element = name.partition(":")
         return self.each(key)[self.columns(key).index(element) if colon else 0]
 

@@ -33,6 +33,7 @@ from fingerspice.circuit.laws import ContactLaw, law_of
 from fingerspice.circuit.network import checked
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.physics.contact import Contact
+from fingerspice.results.measures import Measured
 from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import StoredRecord, kept_rows, variables
 from fingerspice.results.solution import Solution
@@ -201,7 +202,7 @@ _WAVEFORMS = {
     )
 }  # fmt: skip
 _OF_CONTACT = ("d", "eps_r", "f_n", "mu", "p_sat")  # What the signals of a run need of a contact
-_LEFT_OUT = ("where", "text", "path")  # Attributes of a circuit and its elements that a file does not hold here
+_LEFT_OUT = ("where", "text", "path", "measures")  # Attributes of circuits and elements that a file does not hold here
 
 
 def _failure(plain: dict[str, Any]) -> Failure:
@@ -258,6 +259,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
                 "laws": [law_digest(e) for e in solution.circuit.elements],
                 "overrides": dict(solution.circuit.overrides), "summary": solution.summary(), "circuit": circuit,
                 "arrays": len(arrays), "between": between and between[0],
+                "measured": {name: list(one) for name, one in solution.measured.items()},
             }  # fmt: skip
             group.attrs["run"] = json.dumps(run, default=float)
             tables = {f"circuit{k}": array for k, array in enumerate(arrays)}
@@ -340,11 +342,13 @@ def _solution(file: Any) -> Solution:
         values = period[:, 1:].reshape(begin.size, NODES, -1).transpose(0, 2, 1)
         make = partial(StoredRecord, tuple(map(str, run["between"])), sources, fingers)
         continuous = Recorded(whole_steps(begin, end), values, float(run["t_stop"]) - float(run["period"]), make)
-    return Solution(
+    found = Solution(
         t=t, record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:]), circuit=_circuit(file, run),
         continuous=continuous, stored=dict(run["summary"]),
         **{name: make(run[name]) for name, (_, make) in _PLAIN.items()},
     )  # fmt: skip
+    vars(found)["measured"] = {name: Measured(*one) for name, one in run.get("measured", {}).items()}
+    return found
 
 
 def _text(value: Any) -> str:

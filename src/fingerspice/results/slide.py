@@ -19,7 +19,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.results.record import Frictions, Record, Signals
 from fingerspice.results.solution import Solution
-from fingerspice.results.steps import MOST_NUMBERS, Recorded, Stretch, basis, halved, missed
+from fingerspice.results.steps import Recorded, Stretch, basis, halved, missed
 from fingerspice.waveforms.waveform import DC, Waveform, refuse
 
 # Values at the nodes to integrals from the panel's start to each of them, over the panel's length.
@@ -48,7 +48,7 @@ def slid(solution: Solution, speed: Waveform | None = None) -> Solution:
     said = "a friction with a slip needs the run between its outputs from its start on, which is not known here"
     refuse(stretch is None or late, f"{said}; allowed: TSTART 0, method 'auto', and a shorter run that is no stream")
     assert stretch is not None
-    run = _each_once(stretch.run)
+    run = stretch.run.each_once()
 
     def record(slides: Frictions, t: FloatArray, left: BoolArray, rows: FloatArray) -> Signals:
         made = run.make(t, left, rows)
@@ -64,20 +64,6 @@ def slid(solution: Solution, speed: Waveform | None = None) -> Solution:
     return replace(
         solution, record=replace(solution.record, slides=slides), continuous=replace(run, make=partial(record, slides))
     )
-
-
-def _each_once(run: Recorded) -> Recorded:
-    """The steps of a run, in which those that stand for several periods stand once for each."""
-    count = run.times[4].astype(int)
-    if (count == 1).all() and not run.times[5].any():
-        return run
-    refuse(count.sum() * run.values[0].size > MOST_NUMBERS, "a run of so many periods has no slip; allowed: fewer")
-    index = np.repeat(np.arange(count.size), count)
-    later = (1.0 + np.arange(index.size) - np.repeat(np.cumsum(count) - count, count)) * run.times[5, index]
-    times = run.times[:, index] + np.multiply.outer([1.0, 0.0, 1.0, 0.0, 0.0, 0.0], later)
-    times[4], times[5] = 1.0, 0.0
-    order = times[0].argsort(kind="stable")
-    return replace(run, times=times[:, order], values=run.values[index[order]])
 
 
 def _friction(

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fingerspice.circuit.circuit import Circuit
+    from fingerspice.results.measures import Measured
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
     from fingerspice.sets import Citation
@@ -239,6 +240,10 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
         of = "gap" if self.gaps else "layer" if self.layers else "capacitor"
         told = f"estimated error: {of} voltage {error.u_gap:.2g} V"
         told = f"{told}, force {error.f_el:.2g} N" if self.gaps else f"no GAP, no forces; {told}"
+        if self.measured:
+            cells = [(name, one.failed or f"{one.value:.6g}", "" if math.isnan(one.at) else format_si(one.at, "s"))
+                     for name, one in self.measured.items()]  # fmt: skip
+            out += ["", Table(("measure", "value", "at"), cells)]
         out += ["", told if error.v_nodes is None else f"{told}, node voltages {error.v_nodes:.2g} V"]
         if s.get("figures_from") == "outputs":
             out.append("figures are those of the outputs: what lies between them is not known")
@@ -258,6 +263,18 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
     def success(self) -> bool:
         """Whether the run reached its end with the error met."""
         return self.status is Status.SUCCESS
+
+    @cached_property
+    def measured(self) -> dict[str, Measured]:
+        """The measures of the deck's `.meas` lines by name: their ``value``, ``at`` (s), and why one ``failed``."""
+        from fingerspice.results.measures import measured
+
+        return measured(self)
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """Their values alone, NaN where there is none."""
+        return {name: one.value for name, one in self.measured.items()}
 
     def _figure(self, key: str, kind: str) -> Value:
         """A figure of a signal, as in `summary`: a number, an array of several gaps or sources, or None."""
@@ -283,7 +300,7 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
                 return None
             p = span.weigh(name).phasor(self.fundamental.frequency)
             return abs(p) if kind == "amplitude" else math.degrees(cmath.phase(p))
-        low, high = self.remember((name, span is self._whole), lambda: span.extremes(name))
+        (_, low), (_, high) = self.remember((name, span is self._whole), lambda: span.extremes(name))
         figures: dict[str, float] = {"min": low, "max": high, "peak": max(high, -low), "ripple": high - low}
         return figures[kind]
 
@@ -394,7 +411,7 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
             "charge_law": self.charge_law, "area": self.area_mode, "method": self.method, "rtol": repr(self.rtol),
             "error_u_gap_V": repr(error.u_gap), "error_f_el_N": repr(error.f_el),
             "error_q_source_C": repr(error.q_source), "error_v_nodes_V": repr(error.v_nodes),
-            "status": self.status.name, "message": self.message,
+            "status": self.status.name, "message": self.message, "measures": json.dumps(self.measures),
         }  # fmt: skip
 
     def to_csv(self, path: str | Path) -> Path:

@@ -8,8 +8,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +20,9 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, Remembering
 from fingerspice.engine.collocation.readout import RECORDED, Steps, new_steps
 from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS, TO_SERIES
-from fingerspice.results.record import Record, Signals
+from fingerspice.results.record import Named, Record, Signals
 from fingerspice.waveforms.sampling import same_time
-from fingerspice.waveforms.waveform import Waveform
+from fingerspice.waveforms.waveform import Waveform, refuse
 
 #: From times (s), a mask of left-hand values and states as rows to a record.
 Make = Callable[[FloatArray, BoolArray, FloatArray], Signals]
@@ -83,6 +84,20 @@ class Recorded(Remembering):
         """These steps; None where they begin after `since` (s)."""
         return self if since >= self.first - 1e-9 * (until - since) else None
 
+    def each_once(self) -> Recorded:
+        """The same steps, in which those that stand for several periods stand once for each."""
+        count = self.times[4].astype(int)
+        if (count == 1).all() and not self.times[5].any():
+            return self
+        said = f"a run of {count.sum():,} steps is too long to be taken period by period"
+        refuse(count.sum() * self.values[0].size > MOST_NUMBERS, f"{said}; allowed: a shorter one")
+        index = np.repeat(np.arange(count.size), count)
+        later = (1.0 + np.arange(index.size) - np.repeat(np.cumsum(count) - count, count)) * self.times[5, index]
+        times = self.times[:, index] + np.multiply.outer([1.0, 0.0, 1.0, 0.0, 0.0, 0.0], later)
+        times[4], times[5] = 1.0, 0.0
+        order = times[0].argsort(kind="stable")
+        return replace(self, times=times[:, order], values=self.values[index[order]])
+
     def panels(self, since: float, until: float) -> Panels:
         """Parts of the steps between two times (s); equal periods are one panel with the duration of all of them."""
         start, length, reached, reach, count, period = self.times
@@ -122,7 +137,7 @@ class Recorded(Remembering):
         t = np.where(left, reached, start + fraction * length)
         return t, self.make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size).T)
 
-    def at_points(self, name: str, panels: Panels) -> tuple[FloatArray, FloatArray]:
+    def at_points(self, name: Named, panels: Panels) -> tuple[FloatArray, FloatArray]:
         """Times (s) and a signal at the `POINTS` of panels, shape (p, ROWS) each."""
         step = panels[0].astype(int)
         cut = (panels[1] != 0.0) | (panels[2] != self.times[3, step])
@@ -135,7 +150,7 @@ class Recorded(Remembering):
             t[cut], x[cut] = self.values_at(name, panels[:, cut], POINTS)
         return t, x
 
-    def values_at(self, name: str, panels: Panels, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def values_at(self, name: Named, panels: Panels, places: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Times (s) and a signal at places of panels, from 0 to 1, shape (n,) or (p, n); shape (p, n) each."""
         index, (low, high) = panels[0].astype(int), panels[1:3, :, None]
         # Written so that the places 0 and 1 give exactly `low` and `high`.
@@ -295,7 +310,7 @@ class Stretch:
         self.run, self.span, self.rtol = run, (since, until), rtol
         self.panels = run.panels(since, until)
 
-    def weigh(self, name: str, longest: float = math.inf) -> Weighed:
+    def weigh(self, name: Named, longest: float = math.inf) -> Weighed:
         """A signal with weights for its means, on panels as short as `longest` (s)."""
         panels = self.panels
         while (long := panels[3] > longest).any():
@@ -309,15 +324,17 @@ class Stretch:
             return Weighed(t[:, :NODES], share[:, None] * _WEIGHTS, x[:, :NODES])
         return self._cut(name, _FINEST, panels)[0]
 
-    def extremes(self, name: str) -> tuple[float, float]:
-        """Smallest and largest value of a signal, evaluated where its polynomials have their extremes."""
+    def extremes(self, name: Named) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Time (s) and value of a signal's smallest and largest value, where its polynomials have their extremes."""
         # An interpolation error shifts the place of an extreme, which changes the signal there by its square only.
         weighed, panels = self._cut(name, max(_FINEST, 1e-3 * self.rtol), self.panels)
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
         places = np.array([[place] for _, place, _ in found])
-        _, exact = self.run.values_at(name, panels[:, [panel for panel, _, _ in found]], places)
-        low, high = exact[:, 0].tolist()
-        return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
+        t, exact = self.run.values_at(name, panels[:, [panel for panel, _, _ in found]], places)
+        # A node may lie higher than the summit between nodes, by rounding.
+        (low, high), nodes = zip(t[:, 0].tolist(), exact[:, 0].tolist(), strict=True), weighed.x.ravel()
+        pairs = [(float(weighed.t.ravel()[i]), float(nodes[i])) for i in (nodes.argmin(), nodes.argmax())]
+        return min(low, pairs[0], key=itemgetter(1)), max(high, pairs[1], key=itemgetter(1))
 
     def at_nodes(self, names: Sequence[str], tol: float) -> list[FloatArray]:
         """Times (s) and signals at the nodes (p, NODES) of panels on which each misses its polynomial by `tol`."""
@@ -328,11 +345,11 @@ class Stretch:
         found = [self.run.at_points(name, panels) for name in names]
         return [x[:, :NODES] for x in (found[0][0], *(x for _, x in found))]
 
-    def resolved(self, name: str, tol: float) -> Panels:
+    def resolved(self, name: Named, tol: float) -> Panels:
         """Panels on each of which a signal misses its polynomial by at most `tol` of its peak."""
         return self._cut(name, tol, self.panels, np.finfo(float).eps * abs(self.span[1]) / tol)[1]
 
-    def _cut(self, name: str, tol: float, panels: Panels, shortest: float = 0.0) -> tuple[Weighed, Panels]:
+    def _cut(self, name: Named, tol: float, panels: Panels, shortest: float = 0.0) -> tuple[Weighed, Panels]:
         """A signal, and panels on which its interpolation error is at most `tol` of its peak, or as short as told."""
         parts = []
         t, x = self.run.at_points(name, panels)
@@ -359,7 +376,7 @@ class Outputs(NamedTuple):
     since: float = -math.inf
     tolerance: float = 0.0  # Distance (s) up to which an output is one at that time
 
-    def _values(self, name: str) -> tuple[FloatArray, FloatArray]:
+    def _values(self, name: Named) -> tuple[FloatArray, FloatArray]:
         t, x, ends = self.record.t, self.record.one(name), (self.since - self.tolerance, self.since + self.tolerance)
         first, after = np.searchsorted(t, ends, side="right").tolist()
         if first == after > 0:
@@ -367,14 +384,15 @@ class Outputs(NamedTuple):
         # Of two outputs at a jump, the right-hand one is the first.
         return t[max(after - 1, 0) :], x[max(after - 1, 0) :]
 
-    def weigh(self, name: str, longest: float = math.inf) -> Weighed:
+    def weigh(self, name: Named, longest: float = math.inf) -> Weighed:
         """A signal with weights for its means, whatever `longest` is: nothing is known between the outputs."""
         return weigh_outputs(*self._values(name))
 
-    def extremes(self, name: str) -> tuple[float, float]:
-        """Smallest and largest value of a signal."""
-        _, x = self._values(name)
-        return float(x.min()), float(x.max())
+    def extremes(self, name: Named) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Time (s) and value of a signal's smallest and largest value."""
+        t, x = self._values(name)
+        low, high = ((float(t[i]), float(x[i])) for i in (x.argmin(), x.argmax()))
+        return low, high
 
 
 def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:

@@ -313,7 +313,9 @@ class March(Stepping):
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
+        # A deck's TMAX asks for steps of its own.
         more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
+        more += 2.0 * (t_end - self.t) / self.longest
         self.step[0]["most"] = taken + int(more)
         while (code := super().march(sources, t_end, looks)) == readout.REFERENCE:
             # Add the reference areas that the compiled loop needs next, and that it has written to `wanted`.

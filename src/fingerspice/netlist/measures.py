@@ -1,0 +1,212 @@
+"""The grammar of `.meas` lines."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from fingerspice.base.errors import InputError, Where
+from fingerspice.base.units import parse_number
+from fingerspice.circuit.circuit import Element
+from fingerspice.circuit.measures import EDGES, LAST, OF_DEVICES, Crossing, Measure, Quantity, Vector
+from fingerspice.netlist.expressions import Problem, compiled, evaluated
+from fingerspice.netlist.lexer import Line, nearest
+from fingerspice.waveforms.waveform import refuse
+
+_VECTOR = r"@[\w.]+\[\w+\]|[A-Za-z_]\w*\((?:[^()]|\([^()]*\))*\)"
+_WORDS = re.compile(rf"\s*(?:(?P<sign>=)|(?P<braced>\{{[^{{}}]*\}}|'[^']*')|(?P<vector>{_VECTOR})|(?P<word>[^\s=]+))")
+_IN_BRACES = re.compile(_VECTOR)
+_STATISTICS = ("avg", "rms", "min", "max", "pp", "integ", "min_at", "max_at")
+_ALIASES = {"integral": "integ", "derivative": "deriv", "from": "from", "average": "avg"}
+_FORMS = "AVG RMS MIN MAX PP INTEG MIN_AT MAX_AT FIND DERIV WHEN TRIG PARAM"
+_OTHERS = ("ac", "dc", "op", "noise", "tf", "sp")  # Analyses of which nothing is measured here
+
+
+class _Line:
+    """The words of a `.meas` line from its analysis on, read one after the other."""
+
+    def __init__(self, line: Line, start: int, params: Mapping[str, float], elements: Sequence[Element]) -> None:
+        self.line, self.params, self.elements = line, params, elements
+        self.words = [(m.lastgroup or "", m[m.lastgroup or 0], m.start(m.lastgroup or 0))
+                      for m in _WORDS.finditer(line.text, start)]  # fmt: skip
+        self.at = 0
+
+    @property
+    def where(self) -> Where:
+        """Place of the next word, or of the line's end."""
+        return self.line.where(self.words[self.at][2] if self.at < len(self.words) else len(self.line.text))
+
+    def peek(self) -> str:
+        """The next word in lower case; empty at the end."""
+        return self.words[self.at][1].lower() if self.at < len(self.words) else ""
+
+    def take(self, what: str) -> tuple[str, str]:
+        """Kind and text of the next word."""
+        refuse(self.at >= len(self.words), f".meas ends where {what} is missing", self)
+        kind, text, _ = self.words[self.at]
+        self.at += 1
+        return kind, text
+
+    def equals(self) -> None:
+        """Pass a sign =, if it is the next."""
+        self.at += self.peek() == "="
+
+    def number(self, what: str) -> float:
+        """A number, a parameter or an expression of these."""
+        place = self.where
+        kind, text = self.take(what)
+        inner = text[1:-1] if kind == "braced" else text
+        try:
+            return (
+                parse_number(text)
+                if kind == "word" and text.lower() not in self.params
+                else self.evaluated(inner, place)
+            )
+        except ValueError:
+            raise InputError(f".meas has {text!r} where {what} belongs; allowed: a number", place) from None
+
+    def evaluated(self, text: str, place: Where) -> float:
+        """Value of an expression of parameters."""
+        return evaluated(text, self.params, lambda _: place)
+
+    def quantity(self) -> Quantity:
+        """A vector, or an expression of vectors in braces or as ``par('...')``."""
+        place = self.where
+        kind, text = self.take("a vector")
+        if kind == "vector" and text.lower().startswith("par("):
+            kind, text = "braced", text[4:-1].strip()
+        if kind == "vector":
+            return Quantity(text, (self.vector(text, place),))
+        if kind != "braced":
+            allowed = "V(node), V(a,b), I(Vx), I(Rx), F_EL(Xgap), @Xgap[f_el], or an expression of such in braces"
+            raise InputError(f".meas has {text!r} where a vector belongs; allowed: {allowed}", place)
+        found: list[str] = []
+        bare = _IN_BRACES.sub(lambda m: self._named(m[0], found), text[1:-1])
+        vectors, params = tuple(self.vector(one, place) for one in found), dict(self.params)
+        term = self.compiled(bare, {*params, *(f"vector_{i}" for i in range(len(found)))}, place)
+        return Quantity(text, vectors, lambda *x: term(params | {f"vector_{i}": one for i, one in enumerate(x)}))
+
+    @staticmethod
+    def _named(text: str, found: list[str]) -> str:
+        """A vector's name in an expression; a function's call stays as it is."""
+        name, _, inside = text.partition("(")
+        if name.lower() not in ("v", "i", *OF_DEVICES) and text[0] != "@":
+            return f"{name}({_IN_BRACES.sub(lambda m: _Line._named(m[0], found), inside)}" if inside else text
+        found.append(text)
+        return f"vector_{len(found) - 1}"
+
+    def compiled(self, text: str, known: Iterable[str], place: Where) -> Callable[[Mapping[str, float]], float]:
+        """The function of an expression, whose names have to be known."""
+        try:
+            expression = compiled(text)
+        except Problem as problem:
+            raise InputError(f".meas {text!r}: {problem.message}", place) from None
+        for name in expression.names.keys() - {*known, "pi", "e"}:
+            raise InputError(f".meas {text!r}: {name!r} is not defined{nearest(name, known)}", place)
+        return expression.term
+
+    def vector(self, text: str, place: Where) -> Vector:
+        """A vector that the circuit has."""
+        if text[0] == "@":
+            element, _, key = text[1:-1].partition("[")
+            inside = [element]
+        else:
+            key, _, rest = text.partition("(")
+            # A comma within brackets belongs to a name.
+            inside = [part.strip() for part in re.split(r",(?![^(]*\))", rest[:-1])]
+        key = key.lower()
+        if key == "v":
+            known = {node: None for e in self.elements for node in e.nodes} | {"0": None, "gnd": None}
+            names = tuple("0" if name.lower() == "gnd" else name.lower() for name in inside)
+            what, wrong = "node", next((name for name in names if name not in known), None)
+            refuse(not 1 <= len(names) <= 2, f".meas {text} names {len(names)} nodes; allowed: one or two", place)
+        else:
+            of = {"i": None, **OF_DEVICES}
+            said = f".meas {text} is no vector{nearest(key, of)}; allowed: V, I, {', '.join(OF_DEVICES)}"
+            refuse(key not in of, said, place)
+            elements = {e.name.lower(): e for e in self.elements if key in ("i", "u") or e.device == "GAP"}
+            names = (inside[0].lower(),)
+            known, what = dict.fromkeys(elements), "element" if key == "i" else "layer" if key == "u" else "GAP"
+            wrong = next((name for name in names if name not in known), None)
+            key = OF_DEVICES.get(key, key)
+        if wrong is not None:
+            raise InputError(f".meas {text}: the circuit has no {what} {wrong!r}{nearest(wrong, known)}", place)
+        return Vector(key, names)
+
+    def pairs(self, allowed: Sequence[str]) -> dict[str, float]:
+        """Values of ``KEY=value`` pairs with these keys, as far as they go."""
+        found: dict[str, float] = {}
+        while (key := self.peek()) in allowed:
+            self.at += 1
+            self.equals()
+            last = key in EDGES and self.peek() == "last"
+            self.at += last
+            found[key] = LAST if last else self.number(f"the value of {key.upper()}")
+        return found
+
+    def crossing(self) -> Crossing:
+        """``AT=time``, or ``quantity=value`` or ``quantity VAL=value`` with which of the crossings is meant."""
+        if self.peek() == "at":
+            return Crossing(None, self.pairs(("at",))["at"])
+        before, of, value = self.pairs(("val", "td", *EDGES)), self.quantity(), 0.0
+        if self.peek() == "=":
+            self.at += 1
+            if self.words[self.at : self.at + 1] and self.words[self.at][0] == "vector":
+                of = of.less(self.quantity())
+            else:
+                value = self.number("the value that is crossed")
+        more = before | self.pairs(("val", "td", *EDGES))
+        edge = next((edge for edge in EDGES if edge in more), "cross")
+        number = more.get(edge, 1)
+        refuse(number != LAST and not (number >= 1 and number == int(number)),
+               f".meas counts {edge.upper()}={number:g}; allowed: 1, 2, ... or LAST", self)  # fmt: skip
+        return Crossing(of, more.get("val", value), edge, int(number), more.get("td", 0.0))
+
+
+def read_measure(
+    line: Line, start: int, params: Mapping[str, float], elements: Sequence[Element], before: Sequence[Measure]
+) -> Measure:
+    """A `.meas` line, whose text after the directive begins at `start`; `before` are the measures above it.
+
+    Raises
+    ------
+    InputError
+        For an unknown form, a vector that the circuit does not have, and a name that was given before.
+    """
+    words = _Line(line, start, params, elements)
+    analysis = words.take("the analysis, such as TRAN")[1].lower()
+    name = words.take("the measure's name")[1]
+    refuse(analysis not in ("tran", *_OTHERS), f".meas {analysis!r}; allowed: TRAN", line.where(start))
+    refuse(any(one.name.lower() == name.lower() for one in before), f".meas {name} is given twice", line.where(start))
+    if analysis != "tran":
+        return Measure(name, "none", refused=f"a measure of {analysis.upper()} is not made here")
+    kind = words.take("what is measured")[1].lower()
+    kind = _ALIASES.get(kind, kind)
+    refuse(kind not in _FORMS.lower().split(), f".meas {name} {kind!r}; allowed: {_FORMS}", line.where(start))
+    of = start_at = stop_at = formula = None
+    if kind == "param":
+        words.equals()
+        place = words.where
+        text = line.text[words.words[words.at][2] :] if words.at < len(words.words) else ""
+        text, words.at = text.strip().strip("'{}").strip(), len(words.words)
+        refuse(not text, f".meas {name} PARAM has no expression", place)
+        known = {one.name.lower() for one in before}
+        term, values = words.compiled(text, {*known, *params}, place), dict(params)
+        formula = lambda measured: term({**values, **measured})  # noqa: E731
+    elif kind == "trig":
+        start_at = words.crossing()
+        refuse(words.take("TARG")[1].lower() != "targ", f".meas {name}: TRIG needs TARG after it", line.where(start))
+        stop_at = words.crossing()
+    elif kind == "when":
+        start_at = words.crossing()
+    else:
+        of = words.quantity()
+        if kind in ("find", "deriv"):
+            if words.peek() == "when":
+                words.at += 1
+            start_at = words.crossing()
+    window = words.pairs(("from", "to", "td"))
+    if words.at < len(words.words):
+        raise InputError(f".meas {name}: {words.peek()!r} is not understood here", words.where)
+    since, until = window.get("from", window.get("td")), window.get("to")
+    return Measure(name, kind, of, start_at, stop_at, since, until, formula)

@@ -1,0 +1,225 @@
+"""Measures of a run: means, extremes, crossings and delays, from the run between its outputs where that is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.measures import LAST, Crossing, Measure, Quantity, Vector
+from fingerspice.numerics.lobatto import NODES, TO_SERIES
+from fingerspice.results.record import Signals
+from fingerspice.results.steps import Outputs, Stretch, Weighed, weigh_outputs
+
+if TYPE_CHECKING:
+    from fingerspice.results.solution import Solution
+
+_TOLERANCE = 1e-12  # Of the polynomials in which crossings are looked for, relative to the peak
+
+
+class Failed(Exception):
+    """A measure that has no value, and why."""
+
+
+def values_of(solution: Solution, quantity: Quantity) -> Callable[[Signals], FloatArray]:
+    """A quantity as a function of a record of the run, shape (n_t,)."""
+    columns = [_vector(solution, vector) for vector in quantity.vectors]
+    if quantity.function is None:
+        return columns[0]
+    made = np.vectorize(quantity.function, otypes=[float])
+
+    def values(record: Signals) -> FloatArray:
+        try:
+            return np.asarray(made(*(column(record) for column in columns)))
+        except (ArithmeticError, ValueError) as error:
+            raise Failed(f"{quantity.text} has no value: {error}") from None
+
+    return values
+
+
+def _vector(solution: Solution, vector: Vector) -> Callable[[Signals], FloatArray]:
+    circuit, (first, *more) = solution.circuit, vector.names
+    if vector.kind == "v":
+
+        def difference(record: Signals) -> FloatArray:
+            at = {name.lower(): v for name, v in record.node_voltages.items()}
+            for name in vector.names:
+                if name != "0" and name not in at:
+                    raise Failed(f"node {name} has no voltage of its own")
+            zero = np.zeros(record.t.size)
+            return at.get(first, zero) - (at.get(more[0], zero) if more else zero)
+
+        return difference
+    element = circuit[first]
+    if vector.kind != "i":
+        return lambda record: record.one(next(
+            name for name in record.names(vector.kind) if name.partition(":")[2].lower() in ("", first)
+        ))  # fmt: skip
+    if element.device == "R":
+        across = _vector(solution, Vector("v", element.nodes))
+        return lambda record: across(record) / element.values["value"]
+    if element.device != "V":
+        raise Failed(f"I({element.name}) of a {element.device} is no signal; allowed: of a V or an R")
+
+    def delivered(record: Signals) -> FloatArray:
+        names = [name.lower() for name in record.sources]
+        signs = {e.name.lower(): sign for e, sign in solution.record.network.drives}  # type: ignore[attr-defined]
+        if (currents := record.each("i_source")) is None or not len(currents):
+            raise Failed("the run has no currents; ask for them with charge=True")
+        # SPICE's current flows into the p node.
+        return np.asarray(-currents[names.index(first) if first in names else 0] * signs.get(first, 1.0))
+
+    return delivered
+
+
+class _Course:
+    """A quantity between two times (s), as Chebyshev series on consecutive pieces."""
+
+    def __init__(self, solution: Solution, quantity: Quantity, since: float, until: float) -> None:
+        if not since < until:
+            raise Failed(f"its window from {since:g} to {until:g} s is empty")
+        self.values, self.since, self.until = values_of(solution, quantity), since, until
+        # Currents of sources are known at the outputs only.
+        of_sources = any(one.kind == "i" and solution.circuit[one.names[0]].device == "V" for one in quantity.vectors)
+        found = None if of_sources else solution._stretch(since, until)
+        self.span: Stretch | Outputs = Outputs(solution.record)
+        if found is not None:
+            self.span = Stretch(found.run.each_once(), since, until, solution.rtol)
+            panels = self.span.resolved(self.values, _TOLERANCE)
+            t, x = self.span.run.at_points(self.values, panels)
+            order = t[:, 0].argsort(kind="stable")
+            self.begin, self.length = t[order, 0], panels[3, order]
+            self.series = x[order, :NODES] @ TO_SERIES[:, :NODES]
+        else:
+            self.t, self.x = self._outputs(solution.record)
+            keep = np.diff(self.t) > 0.0
+            self.begin, self.length = self.t[:-1][keep], np.diff(self.t)[keep]
+            low, high = self.x[:-1][keep], self.x[1:][keep]
+            self.series = np.column_stack([0.5 * (low + high), 0.5 * (high - low)])
+        if not self.begin.size:
+            raise Failed("the run has no outputs in its window")
+
+    def _outputs(self, record: Signals) -> tuple[FloatArray, FloatArray]:
+        """Times and values of the outputs in the window, with interpolated ones at its ends."""
+        t, x = record.t, self.values(record)
+        inside = (t > self.since) & (t < self.until)
+        ends = np.interp([self.since, self.until], t, x)
+        return np.r_[self.since, t[inside], self.until], np.r_[ends[0], x[inside], ends[1]]
+
+    def at(self, t: float, derivative: bool = False) -> float:
+        """The value, or the derivative, at a time (s)."""
+        if not self.since <= t <= self.until:
+            raise Failed(f"{t:g} s is outside the run or the window")
+        k = int(np.clip(np.searchsorted(self.begin, t, side="right") - 1, 0, self.begin.size - 1))
+        place, series = 2.0 * (t - self.begin[k]) / self.length[k] - 1.0, self.series[k]
+        if derivative:
+            return float(chebyshev.chebval(place, chebyshev.chebder(series)) * 2.0 / self.length[k])
+        return float(chebyshev.chebval(place, series))
+
+    def weighed(self) -> Weighed:
+        """Values with weights for means."""
+        return self.span.weigh(self.values) if isinstance(self.span, Stretch) else weigh_outputs(self.t, self.x)
+
+    def extreme(self, sign: float) -> tuple[float, float]:
+        """Time (s) and value of the largest value, or with the sign -1 of the smallest."""
+        if isinstance(self.span, Stretch):
+            return self.span.extremes(self.values)[sign > 0.0]
+        place = int((sign * self.x).argmax())
+        return float(self.t[place]), float(self.x[place])
+
+    def crossings(self, value: float) -> Iterator[tuple[float, float]]:
+        """Times (s) at which it crosses a value, each with the sign of its slope there."""
+        series = self.series.copy()
+        series[:, 0] -= value
+        before = 0.0
+        turning = np.abs(series[:, 0]) <= np.abs(series[:, 1:]).sum(axis=1)
+        signs = np.sign(series[:, 0])
+        for k in range(self.begin.size):
+            cuts = [-1.0]
+            if turning[k]:
+                roots = chebyshev.chebroots(chebyshev.chebtrim(series[k]))
+                cuts += sorted(roots.real[(np.abs(roots.imag) < 1e-8) & (np.abs(roots.real) < 1.0)].tolist())
+            for low, high in zip(cuts, [*cuts[1:], 1.0], strict=True):
+                middle = 0.5 * (low + high)
+                sign = float(np.sign(chebyshev.chebval(middle, series[k]))) if turning[k] else float(signs[k])
+                if sign != 0.0:
+                    if before not in (0.0, sign):
+                        yield float(self.begin[k] + 0.5 * (low + 1.0) * self.length[k]), sign
+                    before = sign
+
+
+def _time(solution: Solution, crossing: Crossing, since: float, until: float) -> float:
+    """When a quantity has its value."""
+    if crossing.of is None:
+        return crossing.value
+    course = _Course(solution, crossing.of, max(since, crossing.since), until)
+    wanted = {"rise": (1.0,), "fall": (-1.0,), "cross": (1.0, -1.0)}[crossing.edge]
+    times = [t for t, sign in course.crossings(crossing.value) if sign in wanted]
+    if len(times) < max(crossing.number, 1):
+        low, high = course.extreme(-1.0)[1], course.extreme(1.0)[1]
+        asked = crossing.edge.upper(), "LAST" if crossing.number == LAST else crossing.number
+        said = f"{crossing.of.text} has {len(times)} of {crossing.value:g} where {asked[0]}={asked[1]} is asked for"
+        raise Failed(f"{said}; it runs from {low:g} to {high:g}")
+    return times[LAST if crossing.number == LAST else crossing.number - 1]
+
+
+class Measured(NamedTuple):
+    """A measure's value, NaN where it has none; the time (s) that belongs to it; and why it has none."""
+
+    value: float
+    at: float = math.nan
+    failed: str = ""
+
+
+def _made(solution: Solution, one: Measure, known: Mapping[str, float]) -> Measured:
+    if one.refused:
+        raise Failed(one.refused)
+    if one.formula is not None:
+        try:
+            return Measured(float(one.formula(known)))
+        except Exception as error:
+            raise Failed(f"its expression has no value: {error or type(error).__name__}") from None
+    first, last = solution.first, solution.t_stop
+    since, until = one.since if one.since is not None else first, one.until if one.until is not None else last
+    if since < first or until > last * (1.0 + 1e-12):
+        raise Failed(f"its window from {since:g} to {until:g} s is not within the run from {first:g} to {last:g} s")
+    until = min(until, last)
+    if one.kind == "trig":
+        assert one.start is not None
+        assert one.stop is not None
+        begun, ended = (_time(solution, crossing, since, until) for crossing in (one.start, one.stop))
+        return Measured(ended - begun, ended)
+    if one.kind == "when":
+        assert one.start is not None
+        return Measured(t := _time(solution, one.start, since, until), t)
+    assert one.of is not None
+    course = _Course(solution, one.of, since, until)
+    if one.start is not None:
+        t = _time(solution, one.start, since, until)
+        return Measured(course.at(t, one.kind == "deriv"), t)
+    if one.kind in ("avg", "rms", "integ"):
+        weighed, length = course.weighed(), until - since
+        return Measured(math.sqrt(weighed.mean(2)) if one.kind == "rms"
+                        else weighed.mean() * (length if one.kind == "integ" else 1.0))  # fmt: skip
+    (t_low, low), (t_high, high) = course.extreme(-1.0), course.extreme(1.0)
+    return {
+        "min": Measured(low, t_low), "max": Measured(high, t_high), "pp": Measured(high - low),
+        "min_at": Measured(t_low, t_low), "max_at": Measured(t_high, t_high),
+    }[one.kind]  # fmt: skip
+
+
+def measured(solution: Solution) -> dict[str, Measured]:
+    """The measures of the deck, by name."""
+    found: dict[str, Measured] = {}
+    for one in solution.circuit.measures:
+        try:
+            if solution.t.size < 2:
+                raise Failed("the run has no outputs")
+            found[one.name] = _made(solution, one, {name.lower(): x.value for name, x in found.items()})
+        except Failed as failed:
+            found[one.name] = Measured(math.nan, failed=str(failed))
+    return found

@@ -1,0 +1,205 @@
+"""`.meas` lines: against closed forms, against ngspice, and in every place where a run is shown."""
+
+import json
+import math
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from ngspice_tools import call_ngspice
+from scenes import deck, finger, table1
+
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+W = 200.0 * math.pi
+
+
+def measured(*lines: str, elements: tuple[str, ...] = (), tran: str = ".tran 0.1m 50m uic") -> dict[str, Any]:
+    """The measures of a sine of 2 V and 100 Hz on an R of 1 kohm behind one of 3 kohm, and of other elements."""
+    circuit = deck("V1 a 0 SIN(0 2 100)", "R1 a b 3k", "R2 b 0 1k", *elements, tran, *lines)
+    return fs.simulate(circuit).measured
+
+
+# V(b) is 0.5 sin(W t).
+CLOSED = {
+    "AVG V(b) FROM=0 TO=5m": 0.5 * 2.0 / math.pi, "RMS V(b)": 0.5 / math.sqrt(2.0),
+    "INTEG V(b) FROM=1m TO=4m": 0.5 * (math.cos(W * 1e-3) - math.cos(W * 4e-3)) / W, "MAX V(b)": 0.5,
+    "MIN V(b) FROM=1m TO=3m": 0.5 * math.sin(W * 1e-3), "PP V(a,b)": 3.0, "MAX_AT V(b) TO=10m": 2.5e-3,
+    "MIN_AT V(b) FROM=10m TO=20m": 17.5e-3, "FIND V(a) AT=1.3m": 2.0 * math.sin(W * 1.3e-3),
+    "DERIV V(b) AT=1.3m": 0.5 * W * math.cos(W * 1.3e-3), "WHEN V(b)=0.2": math.asin(0.4) / W,
+    "WHEN V(b)=0.2 CROSS=2": 5e-3 - math.asin(0.4) / W, "WHEN V(b)=0.2 RISE=3": 20e-3 + math.asin(0.4) / W,
+    "WHEN V(b)=-0.2 FALL=1": 5e-3 + math.asin(0.4) / W, "WHEN V(b)=0.2 CROSS=LAST": 45e-3 - math.asin(0.4) / W,
+    "WHEN V(b)=level RISE=1 TD=3m": 10e-3 + math.asin(0.4) / W, "WHEN V(b)='level*2' FALL=1": 5e-3 - math.asin(0.8) / W,
+    "FIND V(a) WHEN V(b)={level} FALL=2": 0.8, "DERIV V(a) WHEN V(b)=0 FALL=1": -2.0 * W,
+    "TRIG V(b) VAL=0.1 RISE=1 TARG V(b) VAL=0.4 RISE=2": 10e-3 + (math.asin(0.8) - math.asin(0.2)) / W,
+    "TRIG AT=1m TARG V(b)=0 FALL=1": 4e-3, "TRIG V(a)=1 CROSS=1 TD=2m TARG AT=9m": 9e-3 - (5e-3 - math.asin(0.5) / W),
+    "RMS {V(a)-4*V(b)}": 0.0, "AVG {V(b)^2+level}": 0.125 + 0.2, "MAX par('2*V(b)*V(b)')": 0.5, "PP I(R2)": 1e-3,
+    "MAX I(V1)": 5e-4, "PARAM='2*m0+level'": 2.0 * 0.5 * 2.0 / math.pi + 0.2, "PARAM m3*2": 1.0,
+}  # fmt: skip
+
+
+def test_measures_are_their_closed_forms() -> None:
+    lines = [f".meas tran m{k} {form}" for k, form in enumerate(CLOSED)]
+    found = measured(".param level=0.2", *lines)
+    for k, (form, expected) in enumerate(CLOSED.items()):
+        one = found[f"m{k}"]
+        assert one.failed == "", form
+        size = 1e-10 if "I(V1)" not in form else 1e-6
+        assert one.value == pytest.approx(expected, rel=size, abs=1e-12), form
+    assert found["m19"].at == pytest.approx(10e-3 + math.asin(0.8) / W, rel=1e-12)
+
+
+def test_a_jump_is_crossed_at_its_time_and_a_square_has_exact_means() -> None:
+    elements = ("V2 c 0 SQUARE(1 100 0.3)", "R3 c 0 1k")
+    found = measured(
+        ".meas tran up WHEN V(c)=0.5 RISE=2", ".meas tran down WHEN V(c)=0 FALL=3", ".meas tran mean AVG V(c) TO=10m",
+        ".meas tran fast WHEN V(c)=V(b) CROSS=LAST", elements=elements,
+    )  # fmt: skip
+    assert found["up"].value == pytest.approx(20e-3, rel=1e-12)
+    assert found["down"].value == pytest.approx(23e-3, rel=1e-12)
+    assert found["mean"].value == pytest.approx(0.3 - 0.7, rel=1e-10)
+    assert found["fast"].value == pytest.approx(43e-3, rel=1e-12)
+
+
+def of_ngspice(text: str) -> dict[str, float]:
+    """The measures that ngspice prints of a deck."""
+    with tempfile.TemporaryDirectory(prefix="ngspice-") as folder:
+        for name in ("fingerspice.lib", "fingerspice_mobile.lib"):
+            (Path(folder) / name).write_text((CIRCUITS / name).read_text())
+        (Path(folder) / "deck.cir").write_text(text)
+        said = call_ngspice(Path(folder), "deck.cir", timeout=300.0).stdout
+    return {m[1]: float(m[2]) for m in re.finditer(r"^(\w+)\s+=\s+([-+.\deE]+)", said, re.MULTILINE)}
+
+
+#: Forms that both simulators take, each with the size to which its error is relative.
+FORMS = {
+    "MAX V(top)": 200.0, "MIN V(top)": 200.0, "PP V(skin)": 200.0, "AVG V(top)": 200.0,
+    "RMS V(top)": 200.0, "INTEG V(top) FROM=1m TO=7m": 1.0, "FIND V(skin) AT=12.3m": 200.0,
+    "WHEN V(top)=50 RISE=2": 1e-2, "WHEN V(top)=25 CROSS=LAST": 1e-2, "WHEN V(top)=-30 FALL=1": 1e-2,
+    "FIND V(skin) WHEN V(top)=50 CROSS=3": 200.0, "WHEN V(top)=V(skin) CROSS=LAST": 1e-2,
+    "TRIG V(drive) VAL=100 RISE=1 TARG V(top) VAL=50 RISE=1": 1e-2, "TRIG AT=5m TARG V(top) VAL=0 FALL=LAST": 1e-2,
+    "RMS par('V(top)*V(top)')": 4e4, "AVG par('V(top)-V(skin)')": 200.0,
+}  # fmt: skip
+TOP = ("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "foot", f=100.0), "Rfoot foot 0 10k")
+PULSED = ("Vdrive drive 0 PULSE(0 150 1m 0.5m 0.5m 3m 10m)", *TOP[1:])
+SLOW = (
+    "Vdrive drive 0 EXP(-100 180 1m 2m 9m 3m)",
+    "Rs drive top 200k",
+    "Cs top skin 1n",
+    "Rl skin 0 300k",
+    "Cl skin 0 2n",
+)
+
+
+@pytest.mark.parametrize("elements", [TOP, PULSED, SLOW], ids=["sine", "pulse", "rc"])
+def test_ngspice_measures_the_same(elements: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NGSPICE_MEAS_PRECISION", "12")
+    lines = [f".meas tran m{k} {form}" for k, form in enumerate(FORMS)]
+    text = "\n".join(["measures", ".include fingerspice.lib", *elements, ".tran 10u 20m uic", *lines, ".end", ""])
+    theirs = of_ngspice(text.replace("20m uic", "20m 0 0.5u uic"))
+    ours = fs.simulate(fs.parse_netlist(text), rtol=1e-9).measured
+    shared = 0
+    for k, (form, size) in enumerate(FORMS.items()):
+        one, other = ours[f"m{k}"], theirs.get(f"m{k}")
+        # Where nothing crosses, neither has a value.
+        assert math.isnan(one.value) == (other is None), form
+        if other is not None:
+            shared += 1
+            assert one.value == pytest.approx(other, abs=2e-6 * size), form
+    assert shared >= 10
+
+
+def test_devices_signals_are_measured_as_the_figures_of_the_run() -> None:
+    circuit = table1(gap={"p_sat": 300e3})
+    lines = [
+        ".meas tran f AVG F_EL(Xgap)", ".meas tran t MAX @Xgap[f_t]", ".meas tran u RMS u_gap(xgap)",
+        ".meas tran a MIN AREA(Xgap)", ".meas tran r AVG A_REAL(Xgap)", ".meas tran c AVG FRICTION(Xgap)",
+        ".meas tran s MAX @xgap[sigma_el]", ".meas tran l RMS U(Xcoat)",
+    ]  # fmt: skip
+    run = fs.simulate(fs.parse_netlist(circuit.text.replace(".tran", "\n".join([*lines, ".tran"]))))
+    s = run.summary()
+    expected = {"f": s["f_el_mean"], "t": s["f_t_max"], "u": s["u_gap_rms"], "a": s["area_min"], "r": s["a_real_mean"],
+                "c": s["friction_mean"], "s": float(run.sigma_el.max())}  # fmt: skip
+    for name, value in expected.items():
+        assert run.measures[name] == pytest.approx(value, rel=1e-6), name
+    coat = run.by_name("u_layer")["u_layer:Xcoat"]
+    assert run.measures["l"] == pytest.approx(np.sqrt(np.mean(coat[:-1] ** 2)), rel=1e-4)
+
+
+def test_most_periods_of_a_long_run_are_counted_though_few_are_integrated() -> None:
+    circuit = table1()
+    text = circuit.text.replace(
+        ".tran 10u 50m", ".meas tran n WHEN V(top)=0 RISE=150\n.meas tran m AVG F_EL(Xgap)\n.tran 10u 2"
+    )
+    run = fs.simulate(fs.parse_netlist(text))
+    assert run.stats["repeated"] > 100
+    period = fs.steady_state(circuit).solution
+    first = fs.simulate(fs.parse_netlist(text.replace("RISE=150", "RISE=4").replace("10u 2", "10u 60m"))).measures["n"]
+    assert run.measures["n"] == pytest.approx(first + 1.46, abs=1e-9)
+    assert run.measures["m"] == pytest.approx(run.f_el_mean, rel=1e-9)
+    assert run.measures["m"] == pytest.approx(period.f_el_mean, rel=1e-2)
+
+
+def test_measures_are_printed_and_in_json_files_and_loaded_runs(tmp_path: Path, command: Any) -> None:
+    text = table1().text.replace(".tran", ".meas tran top MAX V(top)\n.meas tran none WHEN V(top)=1e4\n.tran")
+    (tmp_path / "pad.cir").write_text(text)
+    run = fs.simulate(fs.read_netlist(tmp_path / "pad.cir"))
+    done = command("run", str(tmp_path / "pad.cir"), "--json", "--no-plot", "--out", str(tmp_path))
+    rows = json.loads(done.out)["measures"]
+    assert [row["name"] for row in rows] == ["top", "none"]
+    assert rows[0]["value"] == run.measures["top"]
+    assert (rows[1]["value"], rows[0]["failed"]) == (None, "")
+    assert "V(top) has 0 of 10000 where CROSS=1 is asked for; it runs from" in rows[1]["failed"]
+    assert "has 0 of 10000" in command("run", str(tmp_path / "pad.cir"), "--no-plot", "--out", str(tmp_path)).out
+    loaded = fs.load(tmp_path / "pad.nc")
+    assert loaded.measures["top"] == run.measures["top"]
+    assert loaded.measured["none"].failed == run.measured["none"].failed
+    assert json.loads(run.to_xarray().attrs["measures"])["top"] == run.measures["top"]
+
+
+WRONG = {
+    "tran x": ".meas ends where what is measured is missing", "tran": ".meas ends where the measure's name",
+    "tran x SUM V(a)": ".meas x 'sum'; allowed: AVG RMS MIN MAX PP", "trn x MAX V(a)": ".meas 'trn'; allowed: TRAN",
+    "tran x MAX V(bb)": r".meas V\(bb\): the circuit has no node 'bb'; did you mean 'b'",
+    "tran x MAX I(R3)": r".meas I\(R3\): the circuit has no element 'r3'",
+    "tran x MAX Q(R1)": r".meas Q\(R1\) is no vector", "tran x MAX 3": "where a vector belongs",
+    "tran x MAX F_EL(R1)": r".meas F_EL\(R1\): the circuit has no GAP 'r1'",
+    "tran x MAX {V(a)+v0}": "'v0' is not defined", "tran x MAX {V(a)+}": "a value is missing",
+    "tran x WHEN V(a)=1 RISE=0": "counts RISE=0; allowed: 1, 2", "tran x WHEN V(a)=1 RISE=1.5": "counts RISE=1.5",
+    "tran x TRIG V(a) VAL=1": ".meas ends where TARG is missing",
+    "tran x AVG V(a) FROM=1m ABOUT=2m": "'about' is not understood",
+    "tran x FIND V(a) AT=soon": "'soon' where the value of AT belongs", "tran x PARAM='y+1'": "'y' is not defined",
+    "tran x PARAM=": "PARAM has no expression", "tran m0 MAX V(a)": ".meas m0 is given twice",
+}  # fmt: skip
+WITHOUT = {
+    "FIND V(b) AT=60m": "0.06 s is outside the run", "MAX {1/(V(b)-V(b))}": "has no value: float division by zero",
+    "AVG V(b) FROM=40m TO=60m": "is not within the run from 0 to 0.05 s",
+    "AVG V(b) FROM=30m TO=20m": "its window from 0.03 to 0.02 s is empty",
+    "WHEN V(b)=0.2 RISE=9": "has 5 of 0.2 where RISE=9", "PARAM='sqrt(0-m0)'": "its expression has no value",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("line", "said"), WRONG.items())
+def test_wrong_measures_are_refused_with_their_place(line: str, said: str) -> None:
+    with pytest.raises(fs.InputError, match=rf"<netlist>:\d+:\d+: .*{said}"):
+        measured(".meas tran m0 MAX V(b)", f".meas {line}")
+
+
+@pytest.mark.parametrize(("line", "said"), WITHOUT.items())
+def test_a_measure_without_a_value_says_why_and_the_others_stand(line: str, said: str) -> None:
+    found = measured(".meas tran m0 MAX V(b)", f".meas tran m1 {line}", ".meas tran m2 PP V(b)", ".meas ac m3 MAX V(b)")
+    assert math.isnan(found["m1"].value)
+    assert said in found["m1"].failed
+    assert found["m2"].value == pytest.approx(1.0, rel=1e-12)
+    assert found["m3"].failed == "a measure of AC is not made here"
+
+
+def test_a_deck_that_bounds_its_steps_keeps_its_method() -> None:
+    run = fs.simulate(deck(*TOP, ".tran 0.1m 20m 0 1u uic"))
+    assert run.method == "exponential"
+    free = fs.simulate(deck(*TOP, ".tran 0.1m 20m uic"))
+    assert np.abs(run.u_gap - free.u_gap).max() <= run.error.u_gap + free.error.u_gap
