@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from fingerspice.results.outcome import Plan as Plan
     from fingerspice.results.outcome import SolveError as SolveError
     from fingerspice.results.outcome import Status as Status
+    from fingerspice.results.rawfile import Raw as Raw
+    from fingerspice.results.rawfile import read_raw as read_raw
     from fingerspice.results.runfile import load as load
     from fingerspice.results.solution import Solution as Solution
     from fingerspice.sets import Citation as Citation
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
     from fingerspice.studies.batch.batch import batch as batch
+    from fingerspice.studies.export import compare_raw as compare_raw
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel

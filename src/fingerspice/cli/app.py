@@ -68,6 +68,7 @@ def run(
     ] = "deck",
     jumps: Annotated[str, "Rows at jumps of the source: both, or none, so that time rises strictly."] = "both",
     csv: Annotated[bool, "Write CSV instead of NetCDF."] = False,
+    raw: Annotated[bool, "Write a raw file of SPICE, too."] = False,
     stream: Annotated[
         bool, "Write a long run piece by piece to a Zarr store, which a second call goes on with."
     ] = False,
@@ -105,13 +106,13 @@ def run(
         from fingerspice.cli.store import run_streamed
 
         refuse(not stream, "--chunk, --signals and --netcdf go with --stream")
-        for option in [key for key, on in (("csv", csv), ("feel", feel), ("schematic", schematic)) if on]:
+        for option in [key for key, on in (("csv", csv), ("raw", raw), ("feel", feel), ("schematic", schematic)) if on]:
             raise InputError(f"--{option} does not go with --stream, which writes Zarr; allowed: --netcdf beside it")
         run_streamed(job, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
         return
     fingers: list[fs.Feel] = []
     refuse(feel and not circuit.by_device("GAP"), "--feel: the circuit has no GAP, so there is no friction to feel")
-    more = [end for end, on in (("_schematic.svg", schematic), ("_feel.png", feel)) if on]
+    more = [end for end, on in (("_schematic.svg", schematic), ("_feel.png", feel), (".raw", raw)) if on]
     job.check_files(circuit, ".csv" if csv else ".nc", ".png", *more)
     with paced("simulating") as update:
         solution = simulate(circuit, **how, jumps=jumps, throw=False, progress=update)
@@ -126,7 +127,7 @@ def run(
             # The outputs are too few or uneven, which is told after the files of the run have been written.
             unfelt = error
     makes: Makes = {
-        ".csv": solution.to_csv, ".nc": solution.to_netcdf,
+        ".csv": solution.to_csv, ".nc": solution.to_netcdf, ".raw": solution.to_raw,
         ".png": lambda: put_beside(solution.plot(), circuit) if schematic else solution.plot(),
         # An SVG file knows no names of our own, and keeps all of them as one text.
         "_schematic.svg": lambda file: circuit.draw().write(file, {"Description": json.dumps(job.about)}),
@@ -225,18 +226,29 @@ def plan(
     job.give(lambda: "\n".join([*head_lines(circuit), "", str(result)]))
 
 
-def compare(job: Job) -> None:
+def compare(
+    job: Job,
+    other: Annotated[Path | None, Option("--with", metavar="FILE.raw", help="Another simulator's run.")] = None,
+) -> None:
     """Compare the periodic state of DECK with its phasor solution, and say what the ripple of the area does.
+
+    Or compare its run with the raw file of ngspice or LTspice.
 
     Examples:
       fingerspice compare circuits/fingerpad.cir
       fingerspice compare circuits/fingerpad_5khz.cir --json --no-plot
+      fingerspice compare finger.cir --with finger.raw
     """
     from fingerspice.solve.simulation import check_arguments
 
     circuit = job.read()
     check_arguments(job.rtol)
     job.check_files(circuit, "_compare.png")
+    if other is not None:
+        beside = fs.compare_raw(circuit, other, charge_law=job.charge_law, rtol=job.rtol)
+        job.answer.update(method=beside.solution.method, **beside.to_dict())
+        job.give(lambda: str(beside), {"_compare.png": beside.plot})
+        return
     result = fs.compare(circuit, charge_law=job.charge_law, rtol=job.rtol)
     job.answer.update(method=result.solution.method, **result.to_dict())
     job.give(lambda: str(result), {"_compare.png": result.plot})
@@ -370,11 +382,11 @@ _FILES = "deck out name overwrite"
 _END = "json no_plot"
 #: Every command with all its options, in the order of its help.
 _COMMANDS: dict[Callable[..., None], str] = {
-    run: f"{_FILES} rtol charge_law area method set finger coating drive source stop start jumps csv "
+    run: f"{_FILES} rtol charge_law area method set finger coating drive source stop start jumps csv raw "
     f"stream chunk signals netcdf feel schematic {_END}",
     ac: f"{_FILES} sweep area amplitude skin finger impedance charge_law rtol set source {_END}",
     plan: "deck rtol charge_law area stop charge set source json",
-    compare: f"{_FILES} rtol charge_law set source {_END}",
+    compare: f"{_FILES} other rtol charge_law set source {_END}",
     studies.limits: f"{_FILES} points span capability limit carrier set source {_END}",
     studies.design: f"table {_FILES} carrier limit slew rate charge_law set {_END}",
     studies.fit: f"table deck free groups out name overwrite average skin profile charge_law set {_END}",

@@ -27,7 +27,7 @@ OWN = {
         "run": "area tier t_stop figures_from error fundamental fold_margin_min signals measures feel stream",
         "ac": "area skin sweeps",
         "plan": "area tier reasons start rates stiff sensitivity error_bound plan_area",
-        "compare": "frequency gaps phasor transient_mean_area transient_coupled",
+        "compare": "frequency gaps phasor transient_mean_area transient_coupled vectors times",
         "limits": "peak voltage sweeps capability",
         "design": "kind rate samples carrier limit slew lead peak at_limit worst rms worst_share rms_share "
         "largest_wanted largest_reached corrections",

@@ -62,18 +62,15 @@ def _vector(solution: Solution, vector: Vector) -> Callable[[Signals], FloatArra
     if element.device == "R":
         across = _vector(solution, Vector("v", element.nodes))
         return lambda record: across(record) / element.values["value"]
-    if element.device != "V":
-        raise Failed(f"I({element.name}) of a {element.device} is no signal; allowed: of a V or an R")
+    if element.device not in "VI":
+        raise Failed(f"I({element.name}) of a {element.device} is no signal; allowed: of a V, an I or an R")
 
-    def delivered(record: Signals) -> FloatArray:
-        names = [name.lower() for name in record.sources]
-        signs = {e.name.lower(): sign for e, sign in solution.record.network.drives}  # type: ignore[attr-defined]
-        if (currents := record.each("i_source")) is None or not len(currents):
+    def current(record: Signals) -> FloatArray:
+        if first not in record.into_sources:
             raise Failed("the run has no currents; ask for them with charge=True")
-        # SPICE's current flows into the p node.
-        return np.asarray(-currents[names.index(first) if first in names else 0] * signs.get(first, 1.0))
+        return record.into_sources[first]
 
-    return delivered
+    return current
 
 
 class _Course:
@@ -84,7 +81,7 @@ class _Course:
             raise Failed(f"its window from {since:g} to {until:g} s is empty")
         self.values, self.since, self.until = values_of(solution, quantity), since, until
         # Currents of sources are known at the outputs only.
-        of_sources = any(one.kind == "i" and solution.circuit[one.names[0]].device == "V" for one in quantity.vectors)
+        of_sources = any(one.kind == "i" and solution.circuit[one.names[0]].device in "VI" for one in quantity.vectors)
         found = None if of_sources else solution._stretch(since, until)
         self.span: Stretch | Outputs = Outputs(solution.record)
         if found is not None:

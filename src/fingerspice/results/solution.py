@@ -467,6 +467,18 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
         index = pandas.Index(self.t[keep], name="time")
         return pandas.DataFrame({name: x[keep] for name, (x, _, _) in self.signals.items()}, index=index)
 
+    def to_raw(self, path: str | Path) -> Path:
+        """Write the run as a raw file of SPICE (binary, doubles): nodes, sources' currents, and devices' own signals.
+
+        Raises
+        ------
+        InputError
+            Where the folder cannot be written.
+        """
+        from fingerspice.results.rawfile import write_raw
+
+        return write_raw(self, Path(path))
+
     def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
         """Write `to_xarray` as a NetCDF file, without the cost of loading xarray; `fs.load` reads it back.
 

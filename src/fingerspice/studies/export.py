@@ -1,4 +1,4 @@
-"""Export of a circuit as one self-contained ngspice deck."""
+"""Export of a circuit as one self-contained ngspice deck, and comparison with the raw file of another simulator."""
 
 from __future__ import annotations
 
@@ -6,10 +6,16 @@ import math
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
+from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.laws import acting_law
@@ -17,7 +23,11 @@ from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import beside_gap, find_branches
 from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from fingerspice.physics.contact import Contact, JkrContact, LawContact
+from fingerspice.plots import drawing
+from fingerspice.results.rawfile import Raw, read_raw
+from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import prepare
+from fingerspice.solve.simulation import simulate
 from fingerspice.solve.starting import start_voltage, starts_uncharged
 from fingerspice.waveforms.periodic import PWL, Pulse
 from fingerspice.waveforms.samples import Samples
@@ -271,3 +281,102 @@ def _points(w: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.nd
 def _refuse_many(points: float, name: str) -> None:
     allowed = f"at most {_MOST}; shorten the run (--stop, or .tran)"
     refuse(points > _MOST, f"{name}: the source would take {points:.0f} PWL points; allowed: {allowed}")
+
+
+# Comparison with another simulator's run
+
+_MOST_DRAWN = 4  # Vectors in a picture, those with the largest differences
+
+
+@dataclass(frozen=True, repr=False)
+class RawComparison(Shown):
+    """A run beside one of another simulator.
+
+    Attributes
+    ----------
+    solution : Solution
+        With outputs at the other run's times.
+    raw : Raw
+    vectors : dict of str to tuple of ndarray, shape (n_t,)
+        What both have, by the other's name: ours, and the other's. Areas are in mm^2, as the other's are.
+    """
+
+    solution: Solution
+    raw: Raw
+    vectors: dict[str, tuple[FloatArray, FloatArray]]
+
+    @property
+    def differences(self) -> dict[str, float]:
+        """Largest difference of each vector over its largest value, the largest first."""
+        found = {
+            name: float(np.abs(ours - theirs).max()) / (float(np.abs(ours).max()) or 1.0)
+            for name, (ours, theirs) in self.vectors.items()
+        }
+        return dict(sorted(found.items(), key=lambda one: -one[1]))
+
+    def _page(self) -> Page:
+        t, rows = self.solution.t, list[tuple[str, ...]]()
+        for name, share in self.differences.items():
+            ours, theirs = self.vectors[name]
+            place = int(np.abs(ours - theirs).argmax())
+            rows.append((name, f"{np.abs(ours).max():.5g}", f"{share:.2g}", format_si(float(t[place]), "s")))
+        head = f"{len(rows)} vectors at {t.size:,} times of '{self.raw.title}', {self.raw.plotname}"
+        return Page([head, "", Table(("vector", "largest", "difference over it", "at"), rows)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The largest differences as plain data."""
+        return {"vectors": self.differences, "times": int(self.solution.t.size)}
+
+    def plot(self) -> drawing.Picture:
+        """Both runs, of the vectors that differ most."""
+        names, areas = (
+            list(self.differences)[:_MOST_DRAWN],
+            {e.nodes[2] for e in self.solution.circuit.by_device("GAP")},
+        )
+        figure, axes = drawing.new_figure(len(names), height=1.0 + 1.3 * len(names), sharex=True)
+        factor, unit = drawing.engineering(float(self.solution.t.max()), "s", 2.0)
+        for ax, name in zip(axes, names, strict=True):
+            styles = ({"linewidth": 3.2, "alpha": 0.45, "label": "here"}, {"linewidth": 1.2, "label": "other"})
+            for values, style, color in zip(self.vectors[name], styles, drawing.CYCLE[:2], strict=True):
+                ax.plot(factor * self.solution.t, values, color=color, **style)  # type: ignore[arg-type]
+            shown = "mm²" if name[2:-1] in areas else "A" if name[0] == "i" else "V"
+            drawing.dress(ax, f"{name} [{shown}]", f"Time [{unit}]" if ax is axes[-1] else "")
+        drawing.legend_above(axes[0])
+        drawing.caption(figure, f"{self.solution.circuit.title} · {self.raw.title}")
+        return figure
+
+
+def compare_raw(
+    circuit: Circuit, raw: Raw | str | Path, *, rtol: float = 1e-8, charge_law: str | None = None
+) -> RawComparison:
+    """Run a circuit at the times of another simulator's run, and compare node voltages, areas and sources' currents.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    raw : Raw, str or Path
+        As `read_raw` gives it, or its file; of several runs in it the first.
+    rtol, charge_law
+        As in `simulate`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is no run in time, or has no vector of this circuit.
+    """
+    require_circuit(circuit)
+    raw = raw if isinstance(raw, Raw) else read_raw(raw)
+    refuse(next(iter(raw.kinds.values())) != "time", f"'{raw.title}' is {raw.plotname}, no run in time; allowed: one")
+    first = raw.steps[0]
+    t, place = np.unique(raw.scale[first].real, return_index=True)
+    refuse(t.size < 2, f"'{raw.title}' has {t.size} times; allowed: two or more")
+    solution = simulate(circuit, t_stop=float(t[-1]), t_eval=t, rtol=rtol, charge_law=charge_law, jumps="none")
+    record, network = solution.record, network_of(circuit)
+    ours = {f"v({name.lower()})": x for name, x in record.node_voltages.items()}
+    ours |= {f"i({name})": x for name, x in record.into_sources.items()}
+    areas = [area.node for area in network.areas if area.gap is not None]
+    ours |= {f"v({node})": 1e6 * x for node, x in zip(areas, record.each("area"), strict=False)}
+    both = {name: (ours[name], x[first].real[place]) for name, x in raw.vectors.items() if name in ours}
+    said = f"'{raw.title}' has the vectors {', '.join([*raw.vectors][:12])}"
+    refuse(not both, f"{said}; allowed: some of {', '.join([*ours][:12])}")
+    return RawComparison(solution, raw, both)

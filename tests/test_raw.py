@@ -1,0 +1,130 @@
+"""Raw files: written and read back, by ngspice too; those of ngspice and LTspice; and runs compared with them."""
+
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from ngspice_tools import call_ngspice
+from scenes import table1
+
+VARIABLES = {"time": "time", "V(top)": "voltage", "I(R1)": "device_current"}
+
+
+def ltspice(flags: str = "real forward", runs: int = 1, **head: str) -> bytes:
+    """A raw file as LTspice writes it: a header in UTF-16, times in double and all else in single precision."""
+    t = np.tile([0.0, -1e-3, 2e-3, 3e-3], runs)
+    n = t.size
+    double = "double" in flags
+    row = np.dtype([("t", "<f8"), ("v", "<f8" if double else "<f4"), ("i", "<f8" if double else "<f4")])
+    rows = np.zeros(n, row)
+    rows["t"], rows["v"], rows["i"] = t, np.arange(n), -0.5 * np.arange(n)
+    about = {"Title": "* C:\\draft.asc", "Date": "Mon", "Plotname": "Transient Analysis", "Flags": flags,
+             "No. Variables": "3", "No. Points": f"{n:12d}", "Offset": "0.0", **head}  # fmt: skip
+    lines = [*(f"{key}: {value}" for key, value in about.items()), "Variables:"]
+    lines += [f"\t{k}\t{name}\t{kind}" for k, (name, kind) in enumerate(VARIABLES.items())]
+    return ("\n".join([*lines, "Binary:"]) + "\n").encode("utf-16-le") + rows.tobytes()
+
+
+def test_a_run_is_read_back_to_the_bit_and_ngspice_loads_it(tmp_path: Path) -> None:
+    run = fs.simulate(table1())
+    assert run.to_raw(tmp_path / "run.raw") == tmp_path / "run.raw"
+    raw = fs.read_raw(tmp_path / "run.raw")
+    np.testing.assert_array_equal(raw.vectors["time"], run.t)
+    np.testing.assert_array_equal(raw.vectors["v(top)"], run.node_voltages["top"])
+    np.testing.assert_array_equal(raw.vectors["@xgap[f_el]"], run.f_el)
+    np.testing.assert_array_equal(raw.vectors["i(vdrive)"], -np.asarray(run.i_source))
+    assert (raw.kinds["time"], raw.kinds["v(top)"], raw.kinds["@xgap[area]"]) == ("time", "voltage", "notype")
+    loads = "load\n.control\nload run.raw\nprint v(top)[100] @xgap[f_el][100] length(time)\nquit 0\n.endc\n.end\n"
+    (tmp_path / "load.cir").write_text(loads)
+    said = call_ngspice(tmp_path, "load.cir", timeout=60.0).stdout
+    assert f"v(top)[100] = {run.node_voltages['top'][100]:.6e}" in said
+    assert f"@xgap[f_el][100] = {run.f_el[100]:.6e}" in said
+    loaded = fs.read_raw(run.to_raw(tmp_path / "again.raw"))
+    assert "fingerspice" not in str(loaded)
+    assert "10001 points" in str(loaded).replace(",", "") or "points, 1 runs" in str(loaded)
+
+
+def test_ngspices_files_are_read_binary_and_ascii_and_compared(tmp_path: Path, command: Callable[..., Any]) -> None:
+    circuit = table1(tran="10u 20m 0 1u uic")
+    (tmp_path / "deck.cir").write_text(fs.export_netlist(circuit))
+    for name, ascii_file in (("binary.raw", "0"), ("text.raw", "1")):
+        subprocess.run(
+            ["ngspice", "-b", "-r", name, "deck.cir"], cwd=tmp_path, capture_output=True, check=False, timeout=120,
+            env=os.environ | {"SPICE_ASCIIRAWFILE": ascii_file},
+        )  # fmt: skip
+    binary, text = (fs.read_raw(tmp_path / name) for name in ("binary.raw", "text.raw"))
+    assert binary.plotname == "Transient Analysis"
+    for name, values in binary.vectors.items():
+        np.testing.assert_allclose(text.vectors[name], values, rtol=1e-14, atol=1e-300)
+    compared = fs.compare_raw(circuit, tmp_path / "binary.raw")
+    assert {"v(drive)", "v(top)", "v(skin)", "v(area)", "i(vdrive)"} <= set(compared.vectors)
+    assert max(compared.differences.values()) < 1e-4
+    ours, theirs = compared.vectors["v(area)"]
+    np.testing.assert_allclose(ours, 1e6 * compared.solution.area, rtol=0)
+    assert compared.differences["v(area)"] == pytest.approx(np.abs(ours - theirs).max() / ours.max())
+    labels = [ax.get_ylabel() for ax in compared.plot().axes]
+    assert "v(area) [mm²]" in labels
+    (tmp_path / "pad.cir").write_text(circuit.text)
+    words = "compare", str(tmp_path / "pad.cir"), "--with", str(tmp_path / "binary.raw"), "--out", str(tmp_path / "o")
+    done = command(*words, "--json")
+    assert json.loads(done.out)["vectors"]["v(top)"] < 1e-5
+    assert (tmp_path / "o" / "pad_compare.png").stat().st_size > 10_000
+    assert command("run", str(tmp_path / "pad.cir"), "--raw", "--no-plot", "--out", str(tmp_path / "o")).code == 0
+    assert fs.read_raw(tmp_path / "o" / "pad.raw").vectors["v(top)"].size > 2000
+
+
+@pytest.mark.parametrize("flags", ["real forward", "real forward double", "real forward stepped"])
+def test_ltspices_files_are_read(tmp_path: Path, flags: str) -> None:
+    runs = 3 if "stepped" in flags else 1
+    (tmp_path / "lt.raw").write_bytes(ltspice(flags, runs))
+    raw = fs.read_raw(tmp_path / "lt.raw")
+    # A time with a minus is that of a point beside which others were left out.
+    np.testing.assert_array_equal(raw.vectors["time"][:4], [0.0, 1e-3, 2e-3, 3e-3])
+    np.testing.assert_array_equal(raw.vectors["v(top)"], np.arange(4.0 * runs))
+    np.testing.assert_array_equal(raw.vectors["i(r1)"], -0.5 * np.arange(4.0 * runs))
+    assert [one.stop - one.start for one in raw.steps] == [4] * runs
+
+
+def test_several_plots_and_complex_vectors_are_read(tmp_path: Path) -> None:
+    head = "Title: t\nDate: d\nPlotname: AC Analysis\nFlags: complex\nNo. Variables: 2\nNo. Points: 2\n"
+    head += "Variables:\n\t0\tfrequency\tfrequency\n\t1\tv(a)\tvoltage\nBinary:\n"
+    z = np.array([[10.0, 1.0 + 2.0j], [100.0, 3.0 - 4.0j]], "<c16")
+    (tmp_path / "two.raw").write_bytes(2 * (head.encode() + z.tobytes()))
+    second = fs.read_raw(tmp_path / "two.raw", plot=1)
+    np.testing.assert_array_equal(second.vectors["v(a)"], z[:, 1])
+    with pytest.raises(fs.InputError, match="has 2 plots; allowed: plot up to 1"):
+        fs.read_raw(tmp_path / "two.raw", plot=2)
+    with pytest.raises(fs.InputError, match="is AC Analysis, no run in time"):
+        fs.compare_raw(table1(), tmp_path / "two.raw")
+
+
+WRONG: dict[str, tuple[bytes, str]] = {
+    "cut short": (ltspice()[:-9], "is cut short: 4 points of 3 variables are 64 bytes, and 55 are there"),
+    "no end of header": (ltspice()[:200], "ends within the header of a plot"),
+    "a table": (b"t,v\n0,1\n", "is no raw file: it begins with 't,v'"),
+    "points": (ltspice(**{"No. Points": "many"}), "has 'no. points' 'many'; allowed: a whole number"),
+    "fast access": (ltspice("real fastaccess"), "has fast access"),
+    "text cut short": (
+        b"Title: t\nFlags: real\nNo. Variables: 1\nNo. Points: 2\nVariables:\n\t0\ttime\ttime\nValues:\n 0\t1.0\n",
+        "is cut short: 2 of 4 values",
+    ),
+    "other circuit": (
+        ltspice().replace("V(top)".encode("utf-16-le"), "V(tip)".encode("utf-16-le")), "has the vectors time, v"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "said"), WRONG.values(), ids=WRONG)
+def test_wrong_files_are_refused_in_one_sentence(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "wrong.raw").write_bytes(content)
+    with pytest.raises(fs.InputError, match=said):
+        fs.compare_raw(table1(), tmp_path / "wrong.raw")
+    with pytest.raises(fs.InputError, match="does not exist"):
+        fs.read_raw(tmp_path / "none.raw")
