@@ -21,10 +21,10 @@ from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.outcome import ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import Sealed, Signalled, Signals, attribute, kept_rows, signal_of, variables
 from fingerspice.results.steps import Outputs, Stretch
-from fingerspice.waveforms.waveform import as_waveform, refuse
+from fingerspice.waveforms.waveform import as_waveform
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     import pandas
     import xarray
@@ -115,14 +115,6 @@ class SampleGradient(Sealed):
     def __repr__(self) -> str:
         told = f"{self.values.size} samples, largest {np.abs(self.values).max(initial=0.0):.4g}, error {self.error:.1g}"
         return f"SampleGradient({self.source}: {told})"
-
-
-def check_signals(circuit: Circuit, names: Iterable[str], varied: Iterable[str] = ()) -> None:
-    """Refuse the real area, or its figures, among names where neither a GAP nor a parameter that varies is a p_sat."""
-    asked = [name for name in names if name.startswith("a_real")]
-    none = all(math.isinf(gap.values["p_sat"]) for gap in circuit.by_device("GAP"))
-    unknown = bool(asked) and none and not any(path.lower().endswith(".p_sat") for path in varied)
-    refuse(unknown, f"{', '.join(asked)} is asked for, and no GAP has a real area; allowed: with p_sat, as p_sat=300k")
 
 
 def figure(key: str, kind: str, doc: str) -> Value:
@@ -468,13 +460,7 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
         return pandas.DataFrame({name: x[keep] for name, (x, _, _) in self.signals.items()}, index=index)
 
     def to_raw(self, path: str | Path) -> Path:
-        """Write the run as a raw file of SPICE (binary, doubles): nodes, sources' currents, and devices' own signals.
-
-        Raises
-        ------
-        InputError
-            Where the folder cannot be written.
-        """
+        """Write the run as a raw file of SPICE (binary, doubles): nodes, sources' currents, and devices' own signals."""
         from fingerspice.results.rawfile import write_raw
 
         return write_raw(self, Path(path))

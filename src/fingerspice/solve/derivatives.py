@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,14 @@ _ASKED = "derivatives by samples are asked for, and "
 
 # The same run of another circuit, with another `rtol`.
 Runner = Callable[[Circuit, float], Solution]
+
+
+def check_signals(circuit: Circuit, names: Iterable[str], varied: Iterable[str] = ()) -> None:
+    """Refuse the real area, or its figures, among names where neither a GAP nor a parameter that varies is a p_sat."""
+    asked = [name for name in names if name.startswith("a_real")]
+    none = all(math.isinf(gap.values["p_sat"]) for gap in circuit.by_device("GAP"))
+    unknown = bool(asked) and none and not any(path.lower().endswith(".p_sat") for path in varied)
+    refuse(unknown, f"{', '.join(asked)} is asked for, and no GAP has a real area; allowed: with p_sat, as p_sat=300k")
 
 
 class _Parameter:

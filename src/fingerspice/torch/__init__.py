@@ -18,7 +18,8 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import own_path, require_circuit
 from fingerspice.results.outcome import SolveError
-from fingerspice.results.solution import DERIVED, MEANS, Solution, check_signals
+from fingerspice.results.solution import DERIVED, MEANS, Solution
+from fingerspice.solve.derivatives import check_signals
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import LEAST_RTOL, REFUSED, batch
 from fingerspice.studies.batch.lockstep import lockstep_form, why_alone

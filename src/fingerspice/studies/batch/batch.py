@@ -21,7 +21,8 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.engine.lockstep.card import require_card
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
-from fingerspice.results.solution import DERIVED, MEANS, check_signals
+from fingerspice.results.solution import DERIVED, MEANS
+from fingerspice.solve.derivatives import check_signals
 from fingerspice.solve.simulation import RTOL_RANGE, rtol_given, simulate
 from fingerspice.studies.batch.lockstep import LOCKSTEP, Ladder, LockstepForm, Slopes, lockstep_form, why_alone
 from fingerspice.studies.steady import steady_state
