@@ -20,12 +20,12 @@ MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along. Contact laws raised them
 # by 1,016 of 1,200, and measures begin the 2,500 of SPICE's directives and devices.
-ALL_LINES = 36_206
+ALL_LINES = 36_315
 ALL_FILES = 134
 PACKAGE_LINES = {
-    "base": 1_028, "circuit": 2_315, "cli": 1_465, "engine": 7_171, "explorer": 1_168, "netlist": 2_255,
-    "numerics": 1_170, "physics": 689, "plots": 1_229, "results": 3_019, "sets": 361, "solve": 5_355,
-    "studies": 6_214, "torch": 374, "waveforms": 2_239,
+    "base": 1_028, "circuit": 2_318, "cli": 1_467, "engine": 7_171, "explorer": 1_168, "netlist": 2_284,
+    "numerics": 1_170, "physics": 689, "plots": 1_229, "results": 3_084, "sets": 361, "solve": 5_363,
+    "studies": 6_215, "torch": 375, "waveforms": 2_239,
 }  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.

@@ -198,6 +198,52 @@ def test_a_measure_without_a_value_says_why_and_the_others_stand(line: str, said
     assert found["m3"].failed == "a measure of AC is not made here"
 
 
+def test_harmonics_are_those_of_the_closed_form_and_of_ngspice() -> None:
+    circuit = deck("V1 a 0 SQUARE(2 100)", "R1 a 0 1k", "V2 b 0 SIN(0.5 1 100 0 0 30)", "R2 b 0 1k",
+                   ".four 100 V(a) {V(b)*V(b)} I(R1)", ".tran 0.1m 50m uic")  # fmt: skip
+    found = fs.simulate(circuit).fourier
+    odd = np.arange(1, 10, 2)
+    square = found["V(a)"]
+    np.testing.assert_allclose(square.magnitude[odd], 8.0 / np.pi / odd, rtol=1e-10)
+    np.testing.assert_allclose(square.magnitude[::2], 0.0, atol=1e-10)
+    np.testing.assert_allclose(square.phase_deg[odd], 0.0, atol=1e-8)
+    assert square.thd == pytest.approx(100.0 * math.sqrt((1.0 / odd[1:] ** 2).sum()), rel=1e-10)
+    np.testing.assert_allclose(found["I(R1)"].magnitude, 1e-3 * square.magnitude, atol=1e-14)
+    # (0.5 + sin)^2 = 0.75 + sin - cos(2 ...)/2, with the phase of 30 degrees.
+    power = found["{V(b)*V(b)}"]
+    np.testing.assert_allclose(power.magnitude[:3], [0.75, 1.0, 0.5], rtol=1e-10)
+    np.testing.assert_allclose(power.phase_deg[1:3], [30.0, -30.0], rtol=1e-9)
+    text = "\n".join(
+        ["t", ".include fingerspice.lib", *TOP, ".four 100 V(top) V(skin)", ".tran 10u 50m uic", ".end", ""]
+    )
+    ours = fs.simulate(fs.parse_netlist(text)).fourier
+    with tempfile.TemporaryDirectory(prefix="ngspice-") as folder:
+        (Path(folder) / "fingerspice.lib").write_text((CIRCUITS / "fingerspice.lib").read_text())
+        (Path(folder) / "deck.cir").write_text(text.replace("50m uic", "50m 0 1u uic"))
+        said = call_ngspice(Path(folder), "deck.cir", timeout=300.0).stdout
+    theirs = re.findall(r"^ (\d) +\S+ +(\S+) +(\S+)", said, re.MULTILINE)
+    assert len(theirs) == 20
+    for name, rows in (("V(top)", theirs[:10]), ("V(skin)", theirs[10:])):
+        for k, (_, magnitude, phase) in enumerate(rows):
+            assert ours[name].magnitude[k] == pytest.approx(float(magnitude), abs=2e-6 * ours[name].magnitude[1])
+            if k % 2:
+                assert ours[name].phase_deg[k] == pytest.approx(float(phase), abs=0.01)
+
+
+def test_harmonics_are_shown_and_refused_where_there_are_none(tmp_path: Path, command: Any) -> None:
+    (tmp_path / "pad.cir").write_text(table1().text.replace(".tran", ".four 100 F_EL(Xgap)\n.four 5 V(top)\n.tran"))
+    words = "run", str(tmp_path / "pad.cir"), "--no-plot", "--out", str(tmp_path)
+    said = command(*words).out
+    assert "F_EL(Xgap): total harmonic distortion" in said
+    assert "V(top): the run holds no whole period of 5 Hz" in said
+    (row,) = json.loads(command(*words, "--overwrite", "--json").out)["fourier"]
+    assert (row["vector"], row["frequency"], len(row["magnitude"])) == ("F_EL(Xgap)", 100.0, 10)
+    for line, told in ((".four 0 V(a)", "fundamental of 0 Hz"), (".four 100", ".four ends where a vector is missing"),
+                       (".four 100 V(x)", r".four V\(x\): the circuit has no node 'x'")):  # fmt: skip
+        with pytest.raises(fs.InputError, match=told):
+            measured(line)
+
+
 def test_a_deck_that_bounds_its_steps_keeps_its_method() -> None:
     run = fs.simulate(deck(*TOP, ".tran 0.1m 20m 0 1u uic"))
     assert run.method == "exponential"

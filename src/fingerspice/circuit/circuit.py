@@ -29,7 +29,7 @@ from fingerspice.circuit.devices import (
     unusual_of_changed,
 )
 from fingerspice.circuit.laws import ContactLaw, law_of
-from fingerspice.circuit.measures import Measure
+from fingerspice.circuit.measures import Measure, Quantity
 from fingerspice.waveforms.waveform import Waveform, as_waveform, refuse, require
 
 CHARGE_LAWS = ("local", "mobile")
@@ -158,6 +158,8 @@ class Circuit(Remembering, Shown):
         Named sets of parameters that were applied, each with the values that it gave, by path.
     measures : tuple of Measure
         Of its `.meas` lines.
+    fourier : tuple of tuple of float and Quantity
+        Of its `.four` lines: fundamental, Hz, and vector.
     related : Remembering
         Cache of results that depend on nodes and devices alone, shared by all circuits that `replace` derives.
     """
@@ -176,6 +178,7 @@ class Circuit(Remembering, Shown):
     overrides: Mapping[str, str] = field(default_factory=dict)
     sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     measures: tuple[Measure, ...] = ()
+    fourier: tuple[tuple[float, Quantity], ...] = ()
     related: Remembering = field(default_factory=Remembering, init=False, repr=False, compare=False)
 
     def _page(self) -> Page:

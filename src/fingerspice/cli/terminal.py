@@ -24,7 +24,7 @@ COMMON = (
 OWN = {
     command: tuple(keys.split())
     for command, keys in {
-        "run": "area tier t_stop figures_from error fundamental fold_margin_min signals measures feel stream",
+        "run": "area tier t_stop figures_from error fundamental fold_margin_min signals measures fourier feel stream",
         "ac": "area skin sweeps",
         "plan": "area tier reasons start rates stiff sensitivity error_bound plan_area",
         "compare": "frequency gaps phasor transient_mean_area transient_coupled vectors times",
@@ -65,6 +65,8 @@ def of_run(solution: fs.Solution) -> dict[str, Any]:
     return {
         "charge_law": solution.charge_law, "method": solution.method, "area": solution.area_mode,
         "tier": solution.plan.tier, "error": vars(solution.error), "signals": rows, "t_stop": s["t_stop"],
+        "fourier": [vars(one) | {x: getattr(one, x).tolist() for x in ("magnitude", "phase_deg")}
+                    for one in solution.fourier.values() if not isinstance(one, str)],
         "measures": [{"name": name, **one._asdict()} for name, one in solution.measured.items()],
         **{key: s.get(key) for key in ("figures_from", "fundamental", "fold_margin_min")},
     }  # fmt: skip

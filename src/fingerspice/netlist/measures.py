@@ -1,4 +1,4 @@
-"""The grammar of `.meas` lines."""
+"""The grammar of `.meas` and `.four` lines."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ _OTHERS = ("ac", "dc", "op", "noise", "tf", "sp")  # Analyses of which nothing i
 
 
 class _Line:
-    """The words of a `.meas` line from its analysis on, read one after the other."""
+    """The words of a `.meas` or `.four` line after its name, read one after the other."""
 
-    def __init__(self, line: Line, start: int, params: Mapping[str, float], elements: Sequence[Element]) -> None:
-        self.line, self.params, self.elements = line, params, elements
+    def __init__(
+        self, line: Line, start: int, params: Mapping[str, float], elements: Sequence[Element], name: str = ".meas"
+    ) -> None:
+        self.line, self.params, self.elements, self.name = line, params, elements, name
         self.words = [(m.lastgroup or "", m[m.lastgroup or 0], m.start(m.lastgroup or 0))
                       for m in _WORDS.finditer(line.text, start)]  # fmt: skip
         self.at = 0
@@ -42,7 +44,7 @@ class _Line:
 
     def take(self, what: str) -> tuple[str, str]:
         """Kind and text of the next word."""
-        refuse(self.at >= len(self.words), f".meas ends where {what} is missing", self)
+        refuse(self.at >= len(self.words), f"{self.name} ends where {what} is missing", self)
         kind, text, _ = self.words[self.at]
         self.at += 1
         return kind, text
@@ -63,7 +65,7 @@ class _Line:
                 else self.evaluated(inner, place)
             )
         except ValueError:
-            raise InputError(f".meas has {text!r} where {what} belongs; allowed: a number", place) from None
+            raise InputError(f"{self.name} has {text!r} where {what} belongs; allowed: a number", place) from None
 
     def evaluated(self, text: str, place: Where) -> float:
         """Value of an expression of parameters."""
@@ -79,7 +81,7 @@ class _Line:
             return Quantity(text, (self.vector(text, place),))
         if kind != "braced":
             allowed = "V(node), V(a,b), I(Vx), I(Rx), F_EL(Xgap), @Xgap[f_el], or an expression of such in braces"
-            raise InputError(f".meas has {text!r} where a vector belongs; allowed: {allowed}", place)
+            raise InputError(f"{self.name} has {text!r} where a vector belongs; allowed: {allowed}", place)
         found: list[str] = []
         bare = _IN_BRACES.sub(lambda m: self._named(m[0], found), text[1:-1])
         vectors, params = tuple(self.vector(one, place) for one in found), dict(self.params)
@@ -100,9 +102,9 @@ class _Line:
         try:
             expression = compiled(text)
         except Problem as problem:
-            raise InputError(f".meas {text!r}: {problem.message}", place) from None
+            raise InputError(f"{self.name} {text!r}: {problem.message}", place) from None
         for name in expression.names.keys() - {*known, "pi", "e"}:
-            raise InputError(f".meas {text!r}: {name!r} is not defined{nearest(name, known)}", place)
+            raise InputError(f"{self.name} {text!r}: {name!r} is not defined{nearest(name, known)}", place)
         return expression.term
 
     def vector(self, text: str, place: Where) -> Vector:
@@ -119,10 +121,10 @@ class _Line:
             known = {node: None for e in self.elements for node in e.nodes} | {"0": None, "gnd": None}
             names = tuple("0" if name.lower() == "gnd" else name.lower() for name in inside)
             what, wrong = "node", next((name for name in names if name not in known), None)
-            refuse(not 1 <= len(names) <= 2, f".meas {text} names {len(names)} nodes; allowed: one or two", place)
+            refuse(not 1 <= len(names) <= 2, f"{self.name} {text} names {len(names)} nodes; allowed: one or two", place)
         else:
             of = {"i": None, **OF_DEVICES}
-            said = f".meas {text} is no vector{nearest(key, of)}; allowed: V, I, {', '.join(OF_DEVICES)}"
+            said = f"{self.name} {text} is no vector{nearest(key, of)}; allowed: V, I, {', '.join(OF_DEVICES)}"
             refuse(key not in of, said, place)
             elements = {e.name.lower(): e for e in self.elements if key in ("i", "u") or e.device == "GAP"}
             names = (inside[0].lower(),)
@@ -130,7 +132,7 @@ class _Line:
             wrong = next((name for name in names if name not in known), None)
             key = OF_DEVICES.get(key, key)
         if wrong is not None:
-            raise InputError(f".meas {text}: the circuit has no {what} {wrong!r}{nearest(wrong, known)}", place)
+            raise InputError(f"{self.name} {text}: the circuit has no {what} {wrong!r}{nearest(wrong, known)}", place)
         return Vector(key, names)
 
     def pairs(self, allowed: Sequence[str]) -> dict[str, float]:
@@ -159,7 +161,7 @@ class _Line:
         edge = next((edge for edge in EDGES if edge in more), "cross")
         number = more.get(edge, 1)
         refuse(number != LAST and not (number >= 1 and number == int(number)),
-               f".meas counts {edge.upper()}={number:g}; allowed: 1, 2, ... or LAST", self)  # fmt: skip
+               f"{self.name} counts {edge.upper()}={number:g}; allowed: 1, 2, ... or LAST", self)  # fmt: skip
         return Crossing(of, more.get("val", value), edge, int(number), more.get("td", 0.0))
 
 
@@ -210,3 +212,22 @@ def read_measure(
         raise InputError(f".meas {name}: {words.peek()!r} is not understood here", words.where)
     since, until = window.get("from", window.get("td")), window.get("to")
     return Measure(name, kind, of, start_at, stop_at, since, until, formula)
+
+
+def read_fourier(
+    line: Line, start: int, params: Mapping[str, float], elements: Sequence[Element]
+) -> list[tuple[float, Quantity]]:
+    """A `.four` line: the fundamental (Hz) with each of its vectors.
+
+    Raises
+    ------
+    InputError
+        For a frequency that is not above 0, and for vectors that the circuit does not have.
+    """
+    words = _Line(line, start, params, elements, ".four")
+    frequency = words.number("the fundamental")
+    refuse(not frequency > 0.0, f".four has a fundamental of {frequency:g} Hz; allowed: more than 0", line.where(start))
+    found = [(frequency, words.quantity())]
+    while words.at < len(words.words):
+        found.append((frequency, words.quantity()))
+    return found

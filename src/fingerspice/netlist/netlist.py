@@ -16,12 +16,12 @@ from fingerspice.base.units import exponent_and_scale, format_si
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element, Tran
 from fingerspice.circuit.devices import DEVICES, REST_AREA, ParameterSpec, mega_note, unit_trap, unusual
 from fingerspice.circuit.laws import ContactLaw, law_of
-from fingerspice.circuit.measures import Measure
+from fingerspice.circuit.measures import Measure, Quantity
 from fingerspice.circuit.network import checked
 from fingerspice.netlist.deck import parse_deck, with_comma
 from fingerspice.netlist.expressions import Call, Number, Token, Value, number
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
-from fingerspice.netlist.measures import read_measure
+from fingerspice.netlist.measures import read_fourier, read_measure
 from fingerspice.netlist.reader import MAX_WARNINGS, OTHERS, Context, Deck, Statement, text_of
 from fingerspice.netlist.sources import read_source
 from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
@@ -96,12 +96,16 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
         notes[MAX_WARNINGS:] = [f"{more} more warnings are not shown"]
     laws = {"mobile" if "mobile" in name.lower() else "local" for name in deck.libraries}
     ac, measures = next(map(read_ac, deck.directives[".ac"]), None), list[Measure]()
-    for line, start in deck.measures:
-        measures.append(read_measure(line, start, deck.params, elements, measures))
+    fourier = list[tuple[float, Quantity]]()
+    for name, line, start in deck.measures:
+        if name == ".four":
+            fourier += read_fourier(line, start, deck.params, elements)
+        else:
+            measures.append(read_measure(line, start, deck.params, elements, measures))
     refuse(len(laws) > 1, "both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
     law, said, effectless = next(iter(laws), None), tuple(notes), (*deck.unused, *unused, *unused_starts)
     read = deck.title, elements, tran, ac, initial, law, work, said, effectless, deck.text, deck.path
-    return checked(Circuit(*read, measures=tuple(measures)))
+    return checked(Circuit(*read, measures=tuple(measures), fourier=tuple(fourier)))
 
 
 def _unusual(deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: dict[str, float]) -> Iterator[str]:

@@ -188,7 +188,10 @@ MAX_WARNINGS = 100  #: Largest number of warnings that are shown.
 MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
-_USED = tuple(".tran .ac .meas .measure .options .ic .param .subckt .ends .include .inc .lib .control .end".split())  # noqa: SIM905
+_USED = (
+    ".tran", ".ac", ".meas", ".measure", ".four", ".options", ".ic", ".param", ".subckt", ".ends", ".include", ".inc",
+    ".lib", ".control", ".end",
+)  # fmt: skip
 _UNUSED = (".print", ".plot", ".save", ".probe", ".title")
 #: Every directive that may stand in a deck; `Deck._direct` says what is done with it.
 DIRECTIVES = (*_USED, ".option", *_UNUSED, ".nodeset", ".backanno", ".endc")
@@ -238,7 +241,8 @@ class Deck:
     unused: dict[str, None] = field(default_factory=dict)  # Ordered set of the directives without effect here
     warnings: list[str] = field(default_factory=list)  # About what is probably not meant, each with its place
     params: dict[str, float] = field(default_factory=dict)  # The deck's own parameters by lower-case name
-    measures: list[tuple[Line, int]] = field(default_factory=list)  # `.meas` lines, and where their arguments begin
+    # Names of `.meas` and `.four` lines, these, and where their arguments begin
+    measures: list[tuple[str, Line, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.root = Subcircuit("", Where(self.file, 1))
@@ -317,9 +321,9 @@ class Deck:
                     for other, first, _ in here.directives:
                         refuse(other == name, f"{name} is given twice, first at {first.where()}", place)
                 here.directives.append((".options" if name == ".option" else name, line, rest))
-            case ".meas" | ".measure":
+            case ".meas" | ".measure" | ".four":
                 refuse(here is not self.root, f"{name} does not belong inside .subckt {here.name}", place)
-                self.measures.append((line, rest))
+                self.measures.append((name, line, rest))
             case ".param":
                 here.params += definitions(line, rest)
                 here.characters += len(line.text)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.base.pages import Table
+from fingerspice.base.units import format_si
 from fingerspice.circuit.measures import LAST, Crossing, Measure, Quantity, Vector
 from fingerspice.numerics.lobatto import NODES, TO_SERIES
 from fingerspice.results.record import Signals
@@ -117,9 +121,11 @@ class _Course:
             return float(chebyshev.chebval(place, chebyshev.chebder(series)) * 2.0 / self.length[k])
         return float(chebyshev.chebval(place, series))
 
-    def weighed(self) -> Weighed:
-        """Values with weights for means."""
-        return self.span.weigh(self.values) if isinstance(self.span, Stretch) else weigh_outputs(self.t, self.x)
+    def weighed(self, longest: float = math.inf) -> Weighed:
+        """Values with weights for means, on pieces of at most `longest` (s)."""
+        return (
+            self.span.weigh(self.values, longest) if isinstance(self.span, Stretch) else weigh_outputs(self.t, self.x)
+        )
 
     def extreme(self, sign: float) -> tuple[float, float]:
         """Time (s) and value of the largest value, or with the sign -1 of the smallest."""
@@ -220,3 +226,85 @@ def measured(solution: Solution) -> dict[str, Measured]:
         except Failed as failed:
             found[one.name] = Measured(math.nan, failed=str(failed))
     return found
+
+
+HARMONICS = 10  #: Of a `.four` line, the mean counted.
+
+
+@dataclass(frozen=True)
+class Fourier:
+    """Harmonics of a vector over the last period of a frequency, from integrals of the run.
+
+    Attributes
+    ----------
+    vector : str
+    frequency : float
+        Hz.
+    magnitude, phase_deg : ndarray, shape (10,)
+        Of the harmonics from the mean on, in the vector's unit, and degrees relative to a sine.
+    thd : float
+        Root of the sum of the squares of all harmonics but the first over the first, %.
+    """
+
+    vector: str
+    frequency: float
+    magnitude: FloatArray
+    phase_deg: FloatArray
+    thd: float
+
+    def table(self) -> Table:
+        """The harmonics as SPICE prints them."""
+        first = self.magnitude[1] or math.nan
+        rows = [
+            (str(k), format_si(k * self.frequency, "Hz"), f"{x:.6g}", f"{phase:.4g}", f"{x / first:.6g}")
+            for k, (x, phase) in enumerate(zip(self.magnitude.tolist(), self.phase_deg.tolist(), strict=True))
+        ]
+        return Table(("", "frequency", "magnitude", "phase [deg]", "over the first"), rows)
+
+
+def _fourier(solution: Solution, quantity: Quantity, frequency: float) -> Fourier:
+    since = solution.t_stop - 1.0 / frequency
+    if since < solution.first - 1e-9 / frequency:
+        raise Failed(f"the run holds no whole period of {frequency:g} Hz")
+    course = _Course(solution, quantity, max(since, solution.first), solution.t_stop)
+    weighed = course.weighed(0.5 / (frequency * HARMONICS))
+    found = [complex(weighed.mean()), *(weighed.phasor(k * frequency) for k in range(1, HARMONICS))]
+    magnitude, phase = np.abs(found), np.degrees(np.angle(found))
+    thd = 100.0 * math.sqrt(float((magnitude[2:] ** 2).sum())) / magnitude[1] if magnitude[1] > 0.0 else math.nan
+    return Fourier(quantity.text, frequency, magnitude, phase, thd)
+
+
+class Measuring:
+    """A result with the measures of its deck."""
+
+    @cached_property
+    def measured(self) -> dict[str, Measured]:
+        """The measures of the deck's `.meas` lines by name: their ``value``, ``at`` (s), and why one ``failed``."""
+        return measured(cast("Solution", self))
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """Their values alone, NaN where there is none."""
+        return {name: one.value for name, one in self.measured.items()}
+
+    @cached_property
+    def fourier(self) -> dict[str, Fourier | str]:
+        """The harmonics of the deck's `.four` lines by vector; in words, why there are none."""
+        found: dict[str, Fourier | str] = {}
+        solution = cast("Solution", self)
+        for frequency, quantity in solution.circuit.fourier:
+            try:
+                found[quantity.text] = _fourier(solution, quantity, frequency)
+            except Failed as failed:
+                found[quantity.text] = str(failed)
+        return found
+
+    def _measures_shown(self) -> Iterator[str | Table]:
+        """The blocks of measures and harmonics on a page."""
+        rows = [(name, one.failed or f"{one.value:.6g}", "" if math.isnan(one.at) else format_si(one.at, "s"))
+                for name, one in self.measured.items()]  # fmt: skip
+        yield from ("", Table(("measure", "value", "at"), rows)) if rows else ()
+        for name, harmonics in self.fourier.items():
+            shown = harmonics if isinstance(harmonics, str) else f"total harmonic distortion {harmonics.thd:.6g} %"
+            yield from ("", f"{name}: {shown}")
+            yield from () if isinstance(harmonics, str) else (harmonics.table(),)

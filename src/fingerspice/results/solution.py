@@ -18,6 +18,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
 from fingerspice.numerics.lobatto import NODES
+from fingerspice.results.measures import Measuring
 from fingerspice.results.outcome import ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import Sealed, Signalled, Signals, attribute, kept_rows, signal_of, variables
 from fingerspice.results.steps import Outputs, Stretch
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.measures import Measured
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
     from fingerspice.sets import Citation
@@ -145,7 +145,7 @@ class Figured:
 
 
 @dataclass(frozen=True, repr=False)
-class Solution(Remembering, Sealed, Shown, Signalled, Figured):
+class Solution(Remembering, Sealed, Shown, Signalled, Figured, Measuring):
     """Time response of a circuit.
 
     Signals are read-only arrays in SI units, computed when they are first asked for. A jump of the source has two rows
@@ -232,10 +232,7 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
         of = "gap" if self.gaps else "layer" if self.layers else "capacitor"
         told = f"estimated error: {of} voltage {error.u_gap:.2g} V"
         told = f"{told}, force {error.f_el:.2g} N" if self.gaps else f"no GAP, no forces; {told}"
-        if self.measured:
-            cells = [(name, one.failed or f"{one.value:.6g}", "" if math.isnan(one.at) else format_si(one.at, "s"))
-                     for name, one in self.measured.items()]  # fmt: skip
-            out += ["", Table(("measure", "value", "at"), cells)]
+        out += self._measures_shown()
         out += ["", told if error.v_nodes is None else f"{told}, node voltages {error.v_nodes:.2g} V"]
         if s.get("figures_from") == "outputs":
             out.append("figures are those of the outputs: what lies between them is not known")
@@ -255,18 +252,6 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
     def success(self) -> bool:
         """Whether the run reached its end with the error met."""
         return self.status is Status.SUCCESS
-
-    @cached_property
-    def measured(self) -> dict[str, Measured]:
-        """The measures of the deck's `.meas` lines by name: their ``value``, ``at`` (s), and why one ``failed``."""
-        from fingerspice.results.measures import measured
-
-        return measured(self)
-
-    @property
-    def measures(self) -> dict[str, float]:
-        """Their values alone, NaN where there is none."""
-        return {name: one.value for name, one in self.measured.items()}
 
     def _figure(self, key: str, kind: str) -> Value:
         """A figure of a signal, as in `summary`: a number, an array of several gaps or sources, or None."""
@@ -460,7 +445,7 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured):
         return pandas.DataFrame({name: x[keep] for name, (x, _, _) in self.signals.items()}, index=index)
 
     def to_raw(self, path: str | Path) -> Path:
-        """Write the run as a raw file of SPICE (binary, doubles): nodes, sources' currents, and devices' own signals."""
+        """Write the run as a raw file of SPICE (binary, doubles): nodes, sources' currents, devices' own signals."""
         from fingerspice.results.rawfile import write_raw
 
         return write_raw(self, Path(path))
