@@ -260,6 +260,9 @@ def test_a_slip_holds_for_networks_files_and_long_runs_and_is_refused_where_it_c
     alone = fs.simulate(table1(gap={"slip": SLIP, "v": SPEED}), t_eval=TIMES, rtol=1e-9)
     np.testing.assert_allclose(both.f_t[:, 0], alone.f_t, rtol=1e-7)
     np.testing.assert_allclose(both.f_t[:, 1], fs.simulate(table1(), t_eval=TIMES, rtol=1e-9).f_t, rtol=1e-7)
+    kept = pickle.loads(pickle.dumps(alone))
+    np.testing.assert_array_equal(kept.f_t, alone.f_t)
+    assert kept.f_t_mean == alone.f_t_mean
     alone.to_netcdf(tmp_path / "run.nc")
     np.testing.assert_array_equal(fs.load(tmp_path / "run.nc").f_t, alone.f_t)
     # Most periods of a long run are not integrated one by one, and its friction is that of every one of them.

@@ -249,3 +249,24 @@ def test_a_deck_that_bounds_its_steps_keeps_its_method() -> None:
     assert run.method == "exponential"
     free = fs.simulate(deck(*TOP, ".tran 0.1m 20m uic"))
     assert np.abs(run.u_gap - free.u_gap).max() <= run.error.u_gap + free.error.u_gap
+
+
+def test_other_spellings_of_both_simulators_are_read() -> None:
+    circuit = deck(
+        ".param vth = 50", "Vdrive drive 0 SIN(0 200 100)", ".subckt pad a b area",
+        *finger("a", "b", f=100.0), ".ends", "X1 drive 0 area1 pad", "X2 drive 0 area2 pad", ".tran 0.1m 20m uic",
+        ".MEASURE TRAN a trig v(drive) val = 100 rise = 1 targ v(X1.top) val=50 rise=1",
+        ".meas tran b MAX V( X1.top , X1.skin )", ".meas tran c when v(x1.top)=vth rise=LAST",
+        ".meas tran d find v(drive) when v(x1.top) = {vth/2} fall=1",
+        ".meas tran e avg F_EL(X2.Xgap) from = 10m to=20m",
+        ".meas tran f max abs(v(drive))-1", ".meas tran g AVG V(drive)*V(drive)", ".meas tran h rms V(area1)",
+        ".meas tran i max '2*V(drive)' TO=4m", ".meas tran j param = 'i/2'",
+    )  # fmt: skip
+    run = fs.simulate(circuit)
+    found = run.measures
+    assert [name for name, one in run.measured.items() if one.failed] == []
+    assert found["b"] == pytest.approx(run.summary()["u_gap:X1.Xgap_max"], rel=1e-7)
+    assert found["e"] == pytest.approx(run.summary()["f_el:X2.Xgap_mean_periodic"], rel=1e-9)
+    assert (found["f"], found["g"]) == (pytest.approx(199.0, rel=1e-9), pytest.approx(2e4, rel=1e-9))
+    assert found["h"] == pytest.approx(1e6 * run.summary()["area:X1.Xgap_rms"], rel=1e-9)
+    assert (found["i"], found["j"]) == (pytest.approx(400.0, rel=1e-9), pytest.approx(200.0, rel=1e-9))

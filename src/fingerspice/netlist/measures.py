@@ -9,7 +9,7 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.measures import EDGES, LAST, OF_DEVICES, Crossing, Measure, Quantity, Vector
-from fingerspice.netlist.expressions import Problem, compiled, evaluated
+from fingerspice.netlist.expressions import FUNCTIONS, Problem, compiled, evaluated
 from fingerspice.netlist.lexer import Line, nearest
 from fingerspice.waveforms.waveform import refuse
 
@@ -19,6 +19,8 @@ _IN_BRACES = re.compile(_VECTOR)
 _STATISTICS = ("avg", "rms", "min", "max", "pp", "integ", "min_at", "max_at")
 _ALIASES = {"integral": "integ", "derivative": "deriv", "from": "from", "average": "avg"}
 _FORMS = "AVG RMS MIN MAX PP INTEG MIN_AT MAX_AT FIND DERIV WHEN TRIG PARAM"
+# Words at which a vector or an expression of vectors has ended.
+_STOPS = ("=", "from", "to", "at", "when", "val", "td", "targ", *EDGES)
 _OTHERS = ("ac", "dc", "op", "noise", "tf", "sp")  # Analyses of which nothing is measured here
 
 
@@ -72,27 +74,45 @@ class _Line:
         return evaluated(text, self.params, lambda _: place)
 
     def quantity(self) -> Quantity:
-        """A vector, or an expression of vectors in braces or as ``par('...')``."""
-        place = self.where
-        kind, text = self.take("a vector")
-        if kind == "vector" and text.lower().startswith("par("):
-            kind, text = "braced", text[4:-1].strip()
-        if kind == "vector":
+        """A vector, or an expression of vectors: as it is, in braces, in quotes, or as ``par('...')``."""
+        place, first = self.where, self.at
+        self.take("a vector")
+        while self.at < len(self.words) and self.peek() not in _STOPS and not self._next_vector(first):
+            self.at += 1
+        end = self.words[self.at][2] if self.at < len(self.words) else len(self.line.text)
+        text = self.line.text[self.words[first][2] : end].strip()
+        alone = self.at == first + 1 and self.words[first][0] == "vector"
+        if text.lower().startswith("par(") and text[-1] == ")":
+            text, alone = text[4:-1].strip(), False
+        if alone and self._is_vector(text):
             return Quantity(text, (self.vector(text, place),))
-        if kind != "braced":
-            allowed = "V(node), V(a,b), I(Vx), I(Rx), F_EL(Xgap), @Xgap[f_el], or an expression of such in braces"
+        if _IN_BRACES.search(text) is None:
+            allowed = "V(node), V(a,b), I(Vx), I(Rx), F_EL(Xgap), @Xgap[f_el], or an expression of such"
             raise InputError(f"{self.name} has {text!r} where a vector belongs; allowed: {allowed}", place)
+        inner = text[1:-1] if text[0] in "{'" and text[-1] in "}'" else text
         found: list[str] = []
-        bare = _IN_BRACES.sub(lambda m: self._named(m[0], found), text[1:-1])
+        bare = _IN_BRACES.sub(lambda m: self._named(m[0], found), inner)
         vectors, params = tuple(self.vector(one, place) for one in found), dict(self.params)
         term = self.compiled(bare, {*params, *(f"vector_{i}" for i in range(len(found)))}, place)
         return Quantity(text, vectors, lambda *x: term(params | {f"vector_{i}": one for i, one in enumerate(x)}))
+
+    def _next_vector(self, first: int) -> bool:
+        """Whether the next word is another vector and not a part of the expression that began at `first`."""
+        kind, _, position = self.words[self.at]
+        _, before, start = self.words[self.at - 1]
+        apart = start + len(before) < position
+        return apart and kind in ("vector", "braced") and before[-1] not in "+-*/^<>?:,"
+
+    @staticmethod
+    def _is_vector(text: str) -> bool:
+        """Whether a call names a vector and no function."""
+        return text[0] == "@" or text.partition("(")[0].lower() not in FUNCTIONS
 
     @staticmethod
     def _named(text: str, found: list[str]) -> str:
         """A vector's name in an expression; a function's call stays as it is."""
         name, _, inside = text.partition("(")
-        if name.lower() not in ("v", "i", *OF_DEVICES) and text[0] != "@":
+        if not _Line._is_vector(text):
             return f"{name}({_IN_BRACES.sub(lambda m: _Line._named(m[0], found), inside)}" if inside else text
         found.append(text)
         return f"vector_{len(found) - 1}"

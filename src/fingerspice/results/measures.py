@@ -20,6 +20,7 @@ from fingerspice.results.record import Signals
 from fingerspice.results.steps import Outputs, Stretch, Weighed, weigh_outputs
 
 if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.solution import Solution
 
 _TOLERANCE = 1e-12  # Of the polynomials in which crossings are looked for, relative to the peak
@@ -50,7 +51,7 @@ def _vector(solution: Solution, vector: Vector) -> Callable[[Signals], FloatArra
     if vector.kind == "v":
 
         def difference(record: Signals) -> FloatArray:
-            at = {name.lower(): v for name, v in record.node_voltages.items()}
+            at = {name.lower(): v for name, v in record.node_voltages.items()} | areas_of(record, circuit)
             for name in vector.names:
                 if name != "0" and name not in at:
                     raise Failed(f"node {name} has no voltage of its own")
@@ -75,6 +76,12 @@ def _vector(solution: Solution, vector: Vector) -> Callable[[Signals], FloatArra
         return record.into_sources[first]
 
     return current
+
+
+def areas_of(record: Signals, circuit: Circuit) -> dict[str, FloatArray]:
+    """Area (mm^2) of each GAP by its area node, as SPICE has it."""
+    nodes = [circuit[gap].nodes[2] for gap in record.gaps]
+    return {node: 1e6 * x for node, x in zip(nodes, record.each("area"), strict=False)}
 
 
 class _Course:

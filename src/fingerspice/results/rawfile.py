@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.results.measures import areas_of
 from fingerspice.waveforms.files import file_fault
 from fingerspice.waveforms.waveform import refuse
 
@@ -71,6 +72,7 @@ def write_raw(solution: Solution, path: Path) -> Path:
         elif key not in ("u_source", "u_layer", "q_source", "i_source", "fold_margin"):
             owner = element or (solution.gaps[0] if solution.gaps else "")
             columns[f"@{owner.lower()}[{key}]" if owner else key] = values, _KINDS.get(unit, "notype")
+    columns |= {f"v({node})": (x, "voltage") for node, x in areas_of(solution.record, solution.circuit).items()}
     columns |= {f"i({name})": (x, "current") for name, x in solution.record.into_sources.items()}
     head = [
         f"Title: {solution.circuit.title}", "Date: -", "Plotname: Transient Analysis", "Flags: real",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -19,7 +19,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.results.record import Frictions, Record, Signals
 from fingerspice.results.solution import Solution
-from fingerspice.results.steps import Recorded, Stretch, basis, halved, missed
+from fingerspice.results.steps import Make, Recorded, Stretch, basis, halved, missed
 from fingerspice.waveforms.waveform import DC, Waveform, refuse
 
 # Values at the nodes to integrals from the panel's start to each of them, over the panel's length.
@@ -49,20 +49,16 @@ def slid(solution: Solution, speed: Waveform | None = None) -> Solution:
     refuse(stretch is None or late, f"{said}; allowed: TSTART 0, method 'auto', and a shorter run that is no stream")
     assert stretch is not None
     run = stretch.run.each_once()
-
-    def record(slides: Frictions, t: FloatArray, left: BoolArray, rows: FloatArray) -> Signals:
-        made = run.make(t, left, rows)
-        assert isinstance(made, Record)
-        return replace(made, slides=slides)
-
-    formed = replace(run, make=partial(record, ()))
+    formed = replace(run, make=partial(_record, run.make, ()))
     slides = tuple(
         _friction(solution, formed, name, gap, speed or DC(gap["v"])) if gap["slip"] > 0.0 else None
         for name, gap in zip(solution.record.names("f_t"), gaps, strict=True)
     )
     assert isinstance(solution.record, Record)
     return replace(
-        solution, record=replace(solution.record, slides=slides), continuous=replace(run, make=partial(record, slides))
+        solution,
+        record=replace(solution.record, slides=slides),
+        continuous=replace(run, make=partial(_record, run.make, slides)),
     )
 
 
@@ -93,10 +89,25 @@ def _friction(
         start = start / (1.0 - share) if share < 1.0 else float(x[0, 0])
     starts = np.array(list(itertools.accumulate(ends[:-1], lambda f, end: end[0] * f + end[1], initial=start)))
     values, begins = kept * (starts[:, None] + gained), t[:, 0]
+    return _Friction(begins, length, values)
 
-    def friction(at: FloatArray) -> FloatArray:
-        panel = np.clip(np.searchsorted(begins, at, side="right") - 1, 0, begins.size - 1)
-        fraction = np.clip((at - begins[panel]) / length[panel], 0.0, 1.0)
-        return np.asarray((values[panel] * basis(fraction[:, None])[:, 0]).sum(axis=1))
 
-    return friction
+@dataclass(frozen=True)
+class _Friction:
+    """Friction (N) as polynomials through values (p, NODES) on panels with their begins and lengths (p,), s."""
+
+    begins: FloatArray
+    length: FloatArray
+    values: FloatArray
+
+    def __call__(self, at: FloatArray) -> FloatArray:
+        panel = np.clip(np.searchsorted(self.begins, at, side="right") - 1, 0, self.begins.size - 1)
+        fraction = np.clip((at - self.begins[panel]) / self.length[panel], 0.0, 1.0)
+        return np.asarray((self.values[panel] * basis(fraction[:, None])[:, 0]).sum(axis=1))
+
+
+def _record(make: Make, slides: Frictions, t: FloatArray, left: BoolArray, rows: FloatArray) -> Signals:
+    """A record with the friction of fingers that slide."""
+    made = make(t, left, rows)
+    assert isinstance(made, Record)
+    return replace(made, slides=slides)

@@ -24,6 +24,7 @@ from fingerspice.circuit.statespace import beside_gap, find_branches
 from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from fingerspice.physics.contact import Contact, JkrContact, LawContact
 from fingerspice.plots import drawing
+from fingerspice.results.measures import areas_of
 from fingerspice.results.rawfile import Raw, read_raw
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import prepare
@@ -371,11 +372,10 @@ def compare_raw(
     t, place = np.unique(raw.scale[first].real, return_index=True)
     refuse(t.size < 2, f"'{raw.title}' has {t.size} times; allowed: two or more")
     solution = simulate(circuit, t_stop=float(t[-1]), t_eval=t, rtol=rtol, charge_law=charge_law, jumps="none")
-    record, network = solution.record, network_of(circuit)
+    record = solution.record
     ours = {f"v({name.lower()})": x for name, x in record.node_voltages.items()}
     ours |= {f"i({name})": x for name, x in record.into_sources.items()}
-    areas = [area.node for area in network.areas if area.gap is not None]
-    ours |= {f"v({node})": 1e6 * x for node, x in zip(areas, record.each("area"), strict=False)}
+    ours |= {f"v({node})": x for node, x in areas_of(record, circuit).items()}
     both = {name: (ours[name], x[first].real[place]) for name, x in raw.vectors.items() if name in ours}
     said = f"'{raw.title}' has the vectors {', '.join([*raw.vectors][:12])}"
     refuse(not both, f"{said}; allowed: some of {', '.join([*ours][:12])}")
