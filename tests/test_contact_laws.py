@@ -251,6 +251,11 @@ def test_a_slip_is_a_first_order_low_pass_of_the_periodic_friction(speed: float)
     np.testing.assert_allclose(lines[1].amplitude[strong], (gain * lines[0].amplitude)[strong], rtol=1e-6)
     assert slow.f_t_mean == pytest.approx(plain.f_t_mean, rel=1e-12)
     assert slow.f_t[0] == pytest.approx(slow.f_t[-1], rel=1e-10)
+    # Over several periods, whose ends are no ends of steps.
+    circuit = table1(gap={"slip": SLIP, "v": speed})
+    twice = fs.simulate(circuit, t_stop=0.02, t_eval=np.array([0.0, 0.01, 0.02]), start="periodic")
+    np.testing.assert_allclose(twice.f_t, twice.f_t[0], rtol=1e-7)
+    assert twice.f_t_mean == pytest.approx(plain.f_t_mean, rel=1e-7)
 
 
 def test_a_slip_holds_for_networks_files_and_long_runs_and_is_refused_where_it_cannot(tmp_path: Path) -> None:

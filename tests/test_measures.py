@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 import re
 import tempfile
 from pathlib import Path
@@ -173,6 +174,7 @@ WRONG = {
     "tran x TRIG V(a) VAL=1": ".meas ends where TARG is missing",
     "tran x AVG V(a) FROM=1m ABOUT=2m": "'about' is not understood",
     "tran x FIND V(a) AT=soon": "'soon' where the value of AT belongs", "tran x PARAM='y+1'": "'y' is not defined",
+    "tran x WHEN V(a)": r"no value that V\(a\) crosses", "tran x WHEN V(a)=1 RISE=1 FALL=2": "has RISE and FALL",
     "tran x PARAM=": "PARAM has no expression", "tran m0 MAX V(a)": ".meas m0 is given twice",
 }  # fmt: skip
 WITHOUT = {
@@ -270,3 +272,48 @@ def test_other_spellings_of_both_simulators_are_read() -> None:
     assert (found["f"], found["g"]) == (pytest.approx(199.0, rel=1e-9), pytest.approx(2e4, rel=1e-9))
     assert found["h"] == pytest.approx(1e6 * run.summary()["area:X1.Xgap_rms"], rel=1e-9)
     assert (found["i"], found["j"]) == (pytest.approx(400.0, rel=1e-9), pytest.approx(200.0, rel=1e-9))
+
+
+def test_a_run_that_stopped_is_measured_up_to_there_and_no_further() -> None:
+    circuit = table1("SIN(0 1500 100)", tran="50u 20m uic", coat={"r": "200meg"})
+    lines = [".meas tran a MAX V(drive)", ".meas tran b AVG V(top) FROM=0 TO=10m", ".meas tran c FIND V(drive) AT=15m"]
+    text = circuit.text.replace(".tran", "\n".join([*lines, ".four 100 V(top)", ".tran"]))
+    with pytest.warns(fs.FingerspiceWarning, match="air breaks down"):
+        run = fs.simulate(fs.parse_netlist(text), charge_law="mobile", throw=False)
+    assert run.status is fs.Status.FOLD
+    stopped = float(run.t[-1])
+    assert stopped < 5e-3
+    assert run.measures["a"] == pytest.approx(np.abs(run.u_source).max(), rel=1e-12)
+    assert f"is not within the run from 0 to {stopped:g} s" in run.measured["b"].failed
+    assert "0.015 s is outside the run" in run.measured["c"].failed
+    assert run.fourier["V(top)"] == "the run holds no whole period of 100 Hz"
+
+
+def test_measures_of_others_that_failed_and_of_signals_that_are_not_there_say_so() -> None:
+    found = measured(
+        ".meas tran m0 WHEN V(b)=9", ".meas tran m1 PARAM='max(1, m0)'", ".meas tran m2 PARAM='m1+1'",
+        ".meas tran m3 PARAM='2*2'",
+    )  # fmt: skip
+    assert [found[name].failed for name in ("m1", "m2")] == ["m0 has no value", "m1 has no value"]
+    assert found["m3"].value == 4.0
+    text = table1().text.replace(".tran", ".meas tran a MAX A_REAL(Xgap)\n.tran")
+    run = fs.simulate(fs.parse_netlist(text))
+    assert run.measured["a"].failed == "Xgap has no a_real; allowed: of a GAP with p_sat"
+
+
+def test_circuits_with_measures_travel_and_files_keep_harmonics_and_currents(tmp_path: Path) -> None:
+    lines = [".meas tran a MAX {V(top)*2}", ".meas tran b PARAM='a/2'", ".meas tran c WHEN V(top)=V(drive) CROSS=2"]
+    text = table1().text.replace(".tran", "\n".join([*lines, ".four 100 V(top)", ".four 5 V(top,skin)", ".tran"]))
+    circuit = fs.parse_netlist(text)
+    run = fs.simulate(circuit)
+    again = fs.simulate(pickle.loads(pickle.dumps(circuit)))
+    assert again.measures == run.measures
+    assert [one.failed for one in run.measured.values()] == ["", "", ""]
+    loaded = fs.load(run.to_netcdf(tmp_path / "run.nc"))
+    np.testing.assert_array_equal(loaded.fourier["V(top)"].magnitude, run.fourier["V(top)"].magnitude)
+    assert loaded.fourier["V(top,skin)"] == run.fourier["V(top,skin)"]
+    raws = [fs.read_raw(one.to_raw(tmp_path / f"{k}.raw")) for k, one in enumerate((run, loaded))]
+    assert set(raws[0].vectors) == set(raws[1].vectors)
+    for name, values in raws[0].vectors.items():
+        np.testing.assert_array_equal(raws[1].vectors[name], values)
+    assert "* The deck's .meas and .four lines are left out." in fs.export_netlist(circuit)

@@ -128,3 +128,22 @@ def test_wrong_files_are_refused_in_one_sentence(tmp_path: Path, content: bytes,
         fs.compare_raw(table1(), tmp_path / "wrong.raw")
     with pytest.raises(fs.InputError, match="does not exist"):
         fs.read_raw(tmp_path / "none.raw")
+
+
+def test_a_run_with_jumps_equals_its_own_raw_file(tmp_path: Path) -> None:
+    circuit = table1("PULSE(0 100 1m 0 0 1m 4m)", tran="50u 8m uic")
+    run = fs.simulate(circuit)
+    assert np.any(np.diff(run.t) == 0.0)
+    compared = fs.compare_raw(circuit, run.to_raw(tmp_path / "jumps.raw"))
+    assert {"v(drive)", "v(top)", "v(area)", "i(vdrive)"} <= set(compared.vectors)
+    assert max(compared.differences.values()) < 1e-7
+
+
+@pytest.mark.parametrize(("plot", "said"), [(-1, "plot"), ("a", "plot"), (1, "has 1 plots; allowed: plot up to 0")])
+def test_wrong_plots_and_empty_files_are_refused(tmp_path: Path, plot: Any, said: str) -> None:
+    (tmp_path / "lt.raw").write_bytes(ltspice())
+    with pytest.raises(fs.InputError, match=said):
+        fs.read_raw(tmp_path / "lt.raw", plot)
+    (tmp_path / "empty.raw").write_bytes(b"")
+    with pytest.raises(fs.InputError, match="is empty"):
+        fs.read_raw(tmp_path / "empty.raw")

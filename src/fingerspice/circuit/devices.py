@@ -62,11 +62,11 @@ def shown(value: float, unit: str) -> str:
     return format_si(value, unit) if unit in _PREFIXED else f"{value:.4g} {unit}".rstrip()
 
 
+PHASE_POLES = 2.0 * np.pi * 10.0 ** np.arange(0.5, 5.6, 0.5)  #: Of a constant-phase element, 1/s, but for the two ends.
 Value = float | FloatArray
 #: Function from an element's values (in the netlist's units), or those of several scenes (n,), to its cells in series,
 #: shape (n_cell, 3) or (n_cell, 3, n): capacitance per area (F/m^2), total leakage (S) and leakage per area (S/m^2). At
 #: a frequency (Hz), the second argument if not None, a dispersive material becomes one cell with its data there.
-PHASE_POLES = 2.0 * np.pi * 10.0 ** np.arange(0.5, 5.6, 0.5)  #: Of a constant-phase element, 1/s, but for the two ends.
 Cells = Callable[[Mapping[str, Value], float | None], FloatArray]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 #: A device's own signals: names in SPICE's words, and the key of each among the signals of a run.
@@ -32,12 +33,13 @@ class Quantity:
 
     def less(self, other: Quantity) -> Quantity:
         """The difference of two quantities."""
-        n, f, g = len(self.vectors), self.function, other.function
+        both = partial(_difference, self.function, other.function, len(self.vectors))
+        return Quantity(f"{self.text} - {other.text}", (*self.vectors, *other.vectors), both)
 
-        def difference(*x: float) -> float:
-            return (x[0] if f is None else f(*x[:n])) - (x[n] if g is None else g(*x[n:]))
 
-        return Quantity(f"{self.text} - {other.text}", (*self.vectors, *other.vectors), difference)
+def _difference(f: Callable[..., float] | None, g: Callable[..., float] | None, n: int, *x: float) -> float:
+    """Difference of a function of the first n values, or the value itself, and one of the others."""
+    return (x[0] if f is None else f(*x[:n])) - (x[n] if g is None else g(*x[n:]))
 
 
 class Crossing(NamedTuple):
@@ -61,5 +63,6 @@ class Measure:
     stop: Crossing | None = None  # Where a delay ends
     since: float | None = None  # s
     until: float | None = None
+    needs: tuple[str, ...] = ()  # Other measures, in lower case, of which `formula` is a function
     formula: Callable[[Mapping[str, float]], float] | None = field(default=None, compare=False)  # Of other measures
     refused: str = ""

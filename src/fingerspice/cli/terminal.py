@@ -65,8 +65,7 @@ def of_run(solution: fs.Solution) -> dict[str, Any]:
     return {
         "charge_law": solution.charge_law, "method": solution.method, "area": solution.area_mode,
         "tier": solution.plan.tier, "error": vars(solution.error), "signals": rows, "t_stop": s["t_stop"],
-        "fourier": [vars(one) | {x: getattr(one, x).tolist() for x in ("magnitude", "phase_deg")}
-                    for one in solution.fourier.values() if not isinstance(one, str)],
+        "fourier": [one.plain() for one in solution.fourier.values() if not isinstance(one, str)],
         "measures": [{"name": name, **one._asdict()} for name, one in solution.measured.items()],
         **{key: s.get(key) for key in ("figures_from", "fundamental", "fold_margin_min")},
     }  # fmt: skip

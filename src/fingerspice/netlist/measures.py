@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.measures import EDGES, LAST, OF_DEVICES, Crossing, Measure, Quantity, Vector
-from fingerspice.netlist.expressions import FUNCTIONS, Problem, compiled, evaluated
+from fingerspice.netlist.expressions import CONSTANTS, FUNCTIONS, Problem, compiled, evaluated
 from fingerspice.netlist.lexer import Line, nearest
 from fingerspice.waveforms.waveform import refuse
 
 _VECTOR = r"@[\w.]+\[\w+\]|[A-Za-z_]\w*\((?:[^()]|\([^()]*\))*\)"
 _WORDS = re.compile(rf"\s*(?:(?P<sign>=)|(?P<braced>\{{[^{{}}]*\}}|'[^']*')|(?P<vector>{_VECTOR})|(?P<word>[^\s=]+))")
 _IN_BRACES = re.compile(_VECTOR)
-_STATISTICS = ("avg", "rms", "min", "max", "pp", "integ", "min_at", "max_at")
-_ALIASES = {"integral": "integ", "derivative": "deriv", "from": "from", "average": "avg"}
+_ALIASES = {"integral": "integ", "derivative": "deriv", "average": "avg"}
 _FORMS = "AVG RMS MIN MAX PP INTEG MIN_AT MAX_AT FIND DERIV WHEN TRIG PARAM"
 # Words at which a vector or an expression of vectors has ended.
 _STOPS = ("=", "from", "to", "at", "when", "val", "td", "targ", *EDGES)
 _OTHERS = ("ac", "dc", "op", "noise", "tf", "sp")  # Analyses of which nothing is measured here
+
+
+def _of_vectors(text: str, params: Mapping[str, float], *x: float) -> float:
+    """Value of an expression at values of its vectors."""
+    return compiled(text).term({**params, **{f"vector_{i}": one for i, one in enumerate(x)}})
+
+
+def _of_measures(text: str, params: Mapping[str, float], measured: Mapping[str, float]) -> float:
+    """Value of an expression at values of other measures."""
+    return compiled(text).term({**params, **measured})
 
 
 class _Line:
@@ -59,25 +70,18 @@ class _Line:
         """A number, a parameter or an expression of these."""
         place = self.where
         kind, text = self.take(what)
+        plain = kind == "word" and text.lower() not in self.params
         inner = text[1:-1] if kind == "braced" else text
         try:
-            return (
-                parse_number(text)
-                if kind == "word" and text.lower() not in self.params
-                else self.evaluated(inner, place)
-            )
+            return parse_number(text) if plain else evaluated(inner, self.params, lambda _: place)
         except ValueError:
             raise InputError(f"{self.name} has {text!r} where {what} belongs; allowed: a number", place) from None
-
-    def evaluated(self, text: str, place: Where) -> float:
-        """Value of an expression of parameters."""
-        return evaluated(text, self.params, lambda _: place)
 
     def quantity(self) -> Quantity:
         """A vector, or an expression of vectors: as it is, in braces, in quotes, or as ``par('...')``."""
         place, first = self.where, self.at
         self.take("a vector")
-        while self.at < len(self.words) and self.peek() not in _STOPS and not self._next_vector(first):
+        while self.at < len(self.words) and self.peek() not in _STOPS and not self._next_vector():
             self.at += 1
         end = self.words[self.at][2] if self.at < len(self.words) else len(self.line.text)
         text = self.line.text[self.words[first][2] : end].strip()
@@ -93,11 +97,11 @@ class _Line:
         found: list[str] = []
         bare = _IN_BRACES.sub(lambda m: self._named(m[0], found), inner)
         vectors, params = tuple(self.vector(one, place) for one in found), dict(self.params)
-        term = self.compiled(bare, {*params, *(f"vector_{i}" for i in range(len(found)))}, place)
-        return Quantity(text, vectors, lambda *x: term(params | {f"vector_{i}": one for i, one in enumerate(x)}))
+        self.check(bare, {*params, *(f"vector_{i}" for i in range(len(found)))}, place)
+        return Quantity(text, vectors, partial(_of_vectors, bare, params))
 
-    def _next_vector(self, first: int) -> bool:
-        """Whether the next word is another vector and not a part of the expression that began at `first`."""
+    def _next_vector(self) -> bool:
+        """Whether the next word is another vector, and no part of the expression before it."""
         kind, _, position = self.words[self.at]
         _, before, start = self.words[self.at - 1]
         apart = start + len(before) < position
@@ -117,15 +121,15 @@ class _Line:
         found.append(text)
         return f"vector_{len(found) - 1}"
 
-    def compiled(self, text: str, known: Iterable[str], place: Where) -> Callable[[Mapping[str, float]], float]:
-        """The function of an expression, whose names have to be known."""
+    def check(self, text: str, known: Iterable[str], place: Where) -> Iterable[str]:
+        """The names in an expression, which have to be known."""
         try:
-            expression = compiled(text)
+            names = compiled(text).names
         except Problem as problem:
             raise InputError(f"{self.name} {text!r}: {problem.message}", place) from None
-        for name in expression.names.keys() - {*known, "pi", "e"}:
+        for name in names.keys() - {*known, *CONSTANTS}:
             raise InputError(f"{self.name} {text!r}: {name!r} is not defined{nearest(name, known)}", place)
-        return expression.term
+        return names
 
     def vector(self, text: str, place: Where) -> Vector:
         """A vector that the circuit has."""
@@ -170,19 +174,22 @@ class _Line:
         """``AT=time``, or ``quantity=value`` or ``quantity VAL=value`` with which of the crossings is meant."""
         if self.peek() == "at":
             return Crossing(None, self.pairs(("at",))["at"])
-        before, of, value = self.pairs(("val", "td", *EDGES)), self.quantity(), 0.0
+        before, of, value = self.pairs(("val", "td", *EDGES)), self.quantity(), math.nan
         if self.peek() == "=":
             self.at += 1
             if self.words[self.at : self.at + 1] and self.words[self.at][0] == "vector":
-                of = of.less(self.quantity())
+                of, value = of.less(self.quantity()), 0.0
             else:
                 value = self.number("the value that is crossed")
         more = before | self.pairs(("val", "td", *EDGES))
-        edge = next((edge for edge in EDGES if edge in more), "cross")
+        value = more.get("val", value)
+        refuse(math.isnan(value), f"{self.name} has no value that {of.text} crosses; allowed: {of.text}=1", self)
+        edge, *others = [edge for edge in EDGES if edge in more] or ["cross"]
+        refuse(others, f"{self.name} has {edge.upper()} and {', '.join(others).upper()}; allowed: one of them", self)
         number = more.get(edge, 1)
         refuse(number != LAST and not (number >= 1 and number == int(number)),
                f"{self.name} counts {edge.upper()}={number:g}; allowed: 1, 2, ... or LAST", self)  # fmt: skip
-        return Crossing(of, more.get("val", value), edge, int(number), more.get("td", 0.0))
+        return Crossing(of, value, edge, int(number), more.get("td", 0.0))
 
 
 def read_measure(
@@ -206,6 +213,7 @@ def read_measure(
     kind = _ALIASES.get(kind, kind)
     refuse(kind not in _FORMS.lower().split(), f".meas {name} {kind!r}; allowed: {_FORMS}", line.where(start))
     of = start_at = stop_at = formula = None
+    needs: tuple[str, ...] = ()
     if kind == "param":
         words.equals()
         place = words.where
@@ -213,8 +221,8 @@ def read_measure(
         text, words.at = text.strip().strip("'{}").strip(), len(words.words)
         refuse(not text, f".meas {name} PARAM has no expression", place)
         known = {one.name.lower() for one in before}
-        term, values = words.compiled(text, {*known, *params}, place), dict(params)
-        formula = lambda measured: term({**values, **measured})  # noqa: E731
+        needs = tuple(known.intersection(words.check(text, {*known, *params}, place)))
+        formula = partial(_of_measures, text, dict(params))
     elif kind == "trig":
         start_at = words.crossing()
         refuse(words.take("TARG")[1].lower() != "targ", f".meas {name}: TRIG needs TARG after it", line.where(start))
@@ -231,7 +239,7 @@ def read_measure(
     if words.at < len(words.words):
         raise InputError(f".meas {name}: {words.peek()!r} is not understood here", words.where)
     since, until = window.get("from", window.get("td")), window.get("to")
-    return Measure(name, kind, of, start_at, stop_at, since, until, formula)
+    return Measure(name, kind, of, start_at, stop_at, since, until, needs, formula)
 
 
 def read_fourier(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -15,6 +15,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.pages import Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.measures import LAST, Crossing, Measure, Quantity, Vector
+from fingerspice.circuit.network import network_of
 from fingerspice.numerics.lobatto import NODES, TO_SERIES
 from fingerspice.results.record import Signals
 from fingerspice.results.steps import Outputs, Stretch, Weighed, weigh_outputs
@@ -61,9 +62,14 @@ def _vector(solution: Solution, vector: Vector) -> Callable[[Signals], FloatArra
         return difference
     element = circuit[first]
     if vector.kind != "i":
-        return lambda record: record.one(next(
-            name for name in record.names(vector.kind) if name.partition(":")[2].lower() in ("", first)
-        ))  # fmt: skip
+
+        def signal(record: Signals) -> FloatArray:
+            for name in record.names(vector.kind):
+                if name.partition(":")[2].lower() in ("", first):
+                    return record.one(name)
+            raise Failed(f"{element.name} has no {vector.kind}; allowed: of a GAP with p_sat")
+
+        return signal
     if element.device == "R":
         across = _vector(solution, Vector("v", element.nodes))
         return lambda record: across(record) / element.values["value"]
@@ -71,17 +77,29 @@ def _vector(solution: Solution, vector: Vector) -> Callable[[Signals], FloatArra
         raise Failed(f"I({element.name}) of a {element.device} is no signal; allowed: of a V, an I or an R")
 
     def current(record: Signals) -> FloatArray:
-        if first not in record.into_sources:
+        if first not in (found := currents_of(record, circuit)):
             raise Failed("the run has no currents; ask for them with charge=True")
-        return record.into_sources[first]
+        return found[first]
 
     return current
 
 
 def areas_of(record: Signals, circuit: Circuit) -> dict[str, FloatArray]:
-    """Area (mm^2) of each GAP by its area node, as SPICE has it."""
-    nodes = [circuit[gap].nodes[2] for gap in record.gaps]
+    """Area (mm^2) of each GAP by its area node, as SPICE has it; none where a file has left out the elements."""
+    nodes = [circuit[gap].nodes[2] for gap in record.gaps] if circuit.elements else []
     return {node: 1e6 * x for node, x in zip(nodes, record.each("area"), strict=False)}
+
+
+def currents_of(record: Signals, circuit: Circuit) -> dict[str, FloatArray]:
+    """Current (A) of each source from its p node through it, as SPICE has it, by name; none likewise."""
+    currents = record.each("i_source")
+    if not circuit.elements or not len(currents):
+        return {}
+    network = network_of(circuit)
+    if network.stack is not None:
+        return {e.name.lower(): -sign * currents[0] for e, sign in network.drives}
+    pairs = enumerate(zip(network.sources, currents, strict=True))
+    return {e.name.lower(): x if k >= network.n_voltage else -x for k, (e, x) in pairs}
 
 
 class _Course:
@@ -185,15 +203,23 @@ class Measured(NamedTuple):
     failed: str = ""
 
 
+def _reached(solution: Solution) -> float:
+    """Time (s) up to which the run is known: its end, or where it stopped."""
+    return solution.t_stop if solution.failure is None else min(float(solution.t[-1]), solution.t_stop)
+
+
 def _made(solution: Solution, one: Measure, known: Mapping[str, float]) -> Measured:
     if one.refused:
         raise Failed(one.refused)
     if one.formula is not None:
+        for name in one.needs:
+            if math.isnan(known[name]):
+                raise Failed(f"{name} has no value")
         try:
             return Measured(float(one.formula(known)))
         except Exception as error:
             raise Failed(f"its expression has no value: {error or type(error).__name__}") from None
-    first, last = solution.first, solution.t_stop
+    first, last = solution.first, _reached(solution)
     since, until = one.since if one.since is not None else first, one.until if one.until is not None else last
     if since < first or until > last * (1.0 + 1e-12):
         raise Failed(f"its window from {since:g} to {until:g} s is not within the run from {first:g} to {last:g} s")
@@ -259,6 +285,16 @@ class Fourier:
     phase_deg: FloatArray
     thd: float
 
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return vars(self) | {name: getattr(self, name).tolist() for name in ("magnitude", "phase_deg")}
+
+    @classmethod
+    def made(cls, plain: Mapping[str, Any]) -> Fourier:
+        """From plain data."""
+        own: dict[str, Any] = {name: np.array(x) if isinstance(x, list) else x for name, x in plain.items()}
+        return cls(**own)
+
     def table(self) -> Table:
         """The harmonics as SPICE prints them."""
         first = self.magnitude[1] or math.nan
@@ -270,10 +306,11 @@ class Fourier:
 
 
 def _fourier(solution: Solution, quantity: Quantity, frequency: float) -> Fourier:
-    since = solution.t_stop - 1.0 / frequency
+    last = _reached(solution)
+    since = last - 1.0 / frequency
     if since < solution.first - 1e-9 / frequency:
         raise Failed(f"the run holds no whole period of {frequency:g} Hz")
-    course = _Course(solution, quantity, max(since, solution.first), solution.t_stop)
+    course = _Course(solution, quantity, max(since, solution.first), last)
     weighed = course.weighed(0.5 / (frequency * HARMONICS))
     found = [complex(weighed.mean()), *(weighed.phasor(k * frequency) for k in range(1, HARMONICS))]
     magnitude, phase = np.abs(found), np.degrees(np.angle(found))

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.arrays import whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.base.pages import Page, Shown, Table
-from fingerspice.results.measures import areas_of
+from fingerspice.results.measures import areas_of, currents_of
 from fingerspice.waveforms.files import file_fault
 from fingerspice.waveforms.waveform import refuse
 
@@ -73,7 +74,7 @@ def write_raw(solution: Solution, path: Path) -> Path:
             owner = element or (solution.gaps[0] if solution.gaps else "")
             columns[f"@{owner.lower()}[{key}]" if owner else key] = values, _KINDS.get(unit, "notype")
     columns |= {f"v({node})": (x, "voltage") for node, x in areas_of(solution.record, solution.circuit).items()}
-    columns |= {f"i({name})": (x, "current") for name, x in solution.record.into_sources.items()}
+    columns |= {f"i({name})": (x, "current") for name, x in currents_of(solution.record, solution.circuit).items()}
     head = [
         f"Title: {solution.circuit.title}", "Date: -", "Plotname: Transient Analysis", "Flags: real",
         f"No. Variables: {len(columns)}", f"No. Points: {solution.t.size}", "Variables:",
@@ -97,7 +98,7 @@ def read_raw(path: str | Path, plot: int = 0) -> Raw:
     InputError
         If the file cannot be read, is cut short or is no raw file, or has no such plot.
     """
-    path = Path(path)
+    path, plot = Path(path), whole_number("plot", plot, 0)
     fault = file_fault(path, MOST_BYTES)
     refuse(fault, f"'{path}' {fault}")
     data, found = path.read_bytes(), list[Raw]()
@@ -107,6 +108,7 @@ def read_raw(path: str | Path, plot: int = 0) -> Raw:
     while len(found) <= plot and data[at:].strip(b"\0\r\n \t"):
         one, at = _plot(path, data, at, "utf-16-le" if wide else "utf-8")
         found.append(one)
+    refuse(not found, f"'{path}' is empty; allowed: a whole raw file")
     refuse(len(found) <= plot, f"'{path}' has {len(found)} plots; allowed: plot up to {len(found) - 1}")
     return found[plot]
 

@@ -130,11 +130,6 @@ class Signals(Sealed):
         """Real contact area of each GAP, m^2; None where no GAP has a `p_sat`."""
         return self._of_gaps(real_area, "f_el", "area") if self._saturates else None
 
-    @property
-    def into_sources(self) -> dict[str, FloatArray]:
-        """Current (A) of each source as SPICE has it, from its p node through it, by name in lower case."""
-        return {name.lower(): -x for name, x in zip(self.sources, self.each("i_source"), strict=False)}
-
     def each(self, key: str) -> Sequence[FloatArray]:
         """A signal of each of its elements, shape (n_t,); none where the run has no such signal."""
         if key == "v":
@@ -387,14 +382,6 @@ class Record(Signals):
     def i_source(self) -> FloatArray | None:
         """Current (A) that each source delivers at that node, without the impulses at jumps."""
         return side_by_side(self.rows[:, -len(self.network.sources) :].T) if self.has_charge else None
-
-    @property
-    def into_sources(self) -> dict[str, FloatArray]:
-        currents, first = self.each("i_source"), self.network.n_voltage
-        if self.network.stack is not None and len(currents):
-            return {e.name.lower(): -sign * currents[0] for e, sign in self.network.drives}
-        pairs = enumerate(zip(self.sources, currents, strict=False))
-        return {name.lower(): x if k >= first else -x for k, (name, x) in pairs}
 
     @cached_property
     def fold_margin(self) -> FloatArray:

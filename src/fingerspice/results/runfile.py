@@ -33,7 +33,7 @@ from fingerspice.circuit.laws import ContactLaw, law_of
 from fingerspice.circuit.network import checked
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.physics.contact import Contact
-from fingerspice.results.measures import Measured
+from fingerspice.results.measures import Fourier, Measured
 from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import StoredRecord, kept_rows, variables
 from fingerspice.results.solution import Solution
@@ -266,6 +266,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
                 "overrides": dict(solution.circuit.overrides), "summary": solution.summary(), "circuit": circuit,
                 "arrays": len(arrays), "between": between and between[0],
                 "measured": {name: list(one) for name, one in solution.measured.items()},
+                "fourier": {k: x if isinstance(x, str) else x.plain() for k, x in solution.fourier.items()},
             }  # fmt: skip
             group.attrs["run"] = json.dumps(run, default=float)
             tables = {f"circuit{k}": array for k, array in enumerate(arrays)}
@@ -354,6 +355,8 @@ def _solution(file: Any) -> Solution:
         **{name: make(run[name]) for name, (_, make) in _PLAIN.items()},
     )  # fmt: skip
     vars(found)["measured"] = {name: Measured(*one) for name, one in run.get("measured", {}).items()}
+    harmonics = run.get("fourier", {}).items()
+    vars(found)["fourier"] = {name: one if isinstance(one, str) else Fourier.made(one) for name, one in harmonics}
     return found
 
 

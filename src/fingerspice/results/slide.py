@@ -7,7 +7,6 @@ polynomials and the finger slides at most one slip length, this is integrated as
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -45,8 +44,9 @@ def slid(solution: Solution, speed: Waveform | None = None) -> Solution:
     refuse(all(gap["slip"] == 0.0 for gap in gaps), "no GAP has a slip; allowed: a slip length, such as slip=11.5u")
     tran, stretch = circuit.tran, solution._stretch(solution.first, solution.t_stop)
     late = tran is not None and tran.start > 0.0 and solution.start != "periodic"
-    said = "a friction with a slip needs the run between its outputs from its start on, which is not known here"
-    refuse(stretch is None or late, f"{said}; allowed: TSTART 0, method 'auto', and a shorter run that is no stream")
+    said = "a friction with a slip needs the run between its outputs from its start on"
+    refuse(late, f"{said}, and TSTART is above 0; allowed: TSTART 0")
+    refuse(stretch is None, f"{said}, which is not known here; allowed: method 'auto', a shorter run that is no stream")
     assert stretch is not None
     run = stretch.run.each_once()
     formed = replace(run, make=partial(_record, run.make, ()))
@@ -80,16 +80,19 @@ def _friction(
     order = t[:, 0].argsort()
     t, x, rate, slid, length = t[order], x[order, :NODES], rate[order, :NODES], slid[order], panels[3, order]
     kept, gained = np.exp(-slid), length[:, None] * ((np.exp(slid) * rate * x) @ _INTEGRAL)
-    ends = list(zip(kept[:, -1].tolist(), (kept[:, -1] * gained[:, -1]).tolist(), strict=True))
+    ends, begins = list(zip(kept[:, -1].tolist(), (kept * gained)[:, -1].tolist(), strict=True)), t[:, 0]
+
+    def from_start(start: float) -> _Friction:
+        starts = list(itertools.accumulate(ends[:-1], lambda f, end: end[0] * f + end[1], initial=start))
+        return _Friction(begins, length, kept * (np.array(starts)[:, None] + gained))
+
     start = float(x[0, 0])
     if solution.start == "periodic" and solution.period is not None:
-        of_period = ends[: int(np.searchsorted(t[:, 0], solution.first + solution.period * (1.0 - 1e-9)))]
-        share = math.prod(keep for keep, _ in of_period)
-        start = list(itertools.accumulate(of_period, lambda f, end: end[0] * f + end[1], initial=0.0))[-1]
-        start = start / (1.0 - share) if share < 1.0 else float(x[0, 0])
-    starts = np.array(list(itertools.accumulate(ends[:-1], lambda f, end: end[0] * f + end[1], initial=start)))
-    values, begins = kept * (starts[:, None] + gained), t[:, 0]
-    return _Friction(begins, length, values)
+        # A period later the friction is a linear function of that at the start.
+        later = np.array([solution.first + solution.period])
+        of_none, of_one = (float(from_start(one)(later)[0]) for one in (0.0, 1.0))
+        start = of_none / (1.0 - (of_one - of_none)) if of_one - of_none < 1.0 else start
+    return from_start(start)
 
 
 @dataclass(frozen=True)

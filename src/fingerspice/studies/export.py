@@ -24,7 +24,7 @@ from fingerspice.circuit.statespace import beside_gap, find_branches
 from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from fingerspice.physics.contact import Contact, JkrContact, LawContact
 from fingerspice.plots import drawing
-from fingerspice.results.measures import areas_of
+from fingerspice.results.measures import areas_of, currents_of
 from fingerspice.results.rawfile import Raw, read_raw
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import prepare
@@ -87,6 +87,8 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     if circuit.overrides:
         changed = ", ".join(f"{k} = {v}" for k, v in circuit.overrides.items())
         lines.append(f"* Changed from the deck: {' '.join(changed.split())}"[:1000])
+    if circuit.measures or circuit.fourier:
+        lines.append("* The deck's .meas and .four lines are left out.")
     for element in circuit.elements:
         for one in filter(None, (element, beside_gap(element))):
             text = _element_line(one, circuit, ratio, areas)
@@ -330,10 +332,8 @@ class RawComparison(Shown):
 
     def plot(self) -> drawing.Picture:
         """Both runs, of the vectors that differ most."""
-        names, areas = (
-            list(self.differences)[:_MOST_DRAWN],
-            {e.nodes[2] for e in self.solution.circuit.by_device("GAP")},
-        )
+        names = list(self.differences)[:_MOST_DRAWN]
+        areas = {gap.nodes[2] for gap in self.solution.circuit.by_device("GAP")}
         figure, axes = drawing.new_figure(len(names), height=1.0 + 1.3 * len(names), sharex=True)
         factor, unit = drawing.engineering(float(self.solution.t.max()), "s", 2.0)
         for ax, name in zip(axes, names, strict=True):
@@ -369,12 +369,14 @@ def compare_raw(
     raw = raw if isinstance(raw, Raw) else read_raw(raw)
     refuse(next(iter(raw.kinds.values())) != "time", f"'{raw.title}' is {raw.plotname}, no run in time; allowed: one")
     first = raw.steps[0]
-    t, place = np.unique(raw.scale[first].real, return_index=True)
+    # Of two values at a jump the right-hand one is the later.
+    t, place = np.unique(raw.scale[first].real[::-1], return_index=True)
+    place = first.stop - first.start - 1 - place
     refuse(t.size < 2, f"'{raw.title}' has {t.size} times; allowed: two or more")
     solution = simulate(circuit, t_stop=float(t[-1]), t_eval=t, rtol=rtol, charge_law=charge_law, jumps="none")
     record = solution.record
     ours = {f"v({name.lower()})": x for name, x in record.node_voltages.items()}
-    ours |= {f"i({name})": x for name, x in record.into_sources.items()}
+    ours |= {f"i({name})": x for name, x in currents_of(record, circuit).items()}
     ours |= {f"v({node})": x for node, x in areas_of(record, circuit).items()}
     both = {name: (ours[name], x[first].real[place]) for name, x in raw.vectors.items() if name in ours}
     said = f"'{raw.title}' has the vectors {', '.join([*raw.vectors][:12])}"
