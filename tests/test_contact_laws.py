@@ -1,7 +1,9 @@
 """Contact laws other than the paper's: a law of one's own, a table and the shipped ones, through every kind of run."""
 
+import dataclasses
 import pickle
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
 
 import analytic as ref
 import fingerspice as fs
@@ -98,6 +101,136 @@ def test_the_laws_of_the_package_have_the_roots_of_their_equations(law: str, are
     np.testing.assert_allclose(solution.area, expected, rtol=1e-11)
     found = reference(np.vectorize(areas), TIMES[:11], sine_slope)
     assert np.abs(solution.u_gap[:11] - found).max() <= max(solution.error.u_gap, 1e-8 * abs(solution.u_gap).max())
+
+
+def closing(u: float, soft: float = 0.5e-6, p_ref: float = 14.3e3) -> tuple[float, float]:
+    """Height (m) at which the asperities carry load and attraction, and the ridge area there, m^2."""
+    under = lambda h: dataclasses.replace(P, d_a=h)  # noqa: E731
+    sigma = lambda h: 0.5 * P.eps0 * P.eps_a * (u / h) ** 2  # noqa: E731
+
+    def miss(h: float) -> float:
+        return float(p_ref * np.exp((P.d_a - h) / soft) - P.force_normal / ref.area(u, under(h)) - sigma(h))
+
+    h = brentq(miss, 2.2e-6, 3.6e-6, xtol=1e-20, rtol=1e-15)
+    return h, float(ref.area(u, under(h)))
+
+
+def of_gap(u: float, law: str) -> tuple[float, float, float]:
+    """Ridge area, m^2, height, m, and leak, S, of Table 1's gap with `law=pullin` or `r_exp`."""
+    h, area = closing(abs(u)) if law == "pullin" else (P.d_a, float(ref.area(abs(u), P)))
+    load = P.force_normal + 0.5 * P.eps0 * P.eps_a * (u / h) ** 2 * area
+    return area, h, (load / 0.5 if law == "r_exp" else 1.0) / P.r_a
+
+
+@pytest.mark.parametrize("charge_law", ["local", "mobile"])
+@pytest.mark.parametrize(("law", "changes"), [("pullin", {"Xgap.law": "pullin"}), ("r_exp", {"Xgap.r_exp": 1.0})])
+def test_gaps_that_close_and_leaks_that_follow_obey_kirchhoffs_law(
+    law: str, changes: dict[str, Any], charge_law: str
+) -> None:
+    circuit = table1(f=100.0).replace({**changes, "Vdrive": fs.Sine(180.0, 100.0)})
+    t = np.linspace(0.0, 4e-3, 41)
+    run = fs.simulate(circuit, t_stop=4e-3, t_eval=t, rtol=1e-8, charge_law=charge_law)
+    assert run.method == "radau"
+    grid = np.linspace(0.0, 150.0, 601)
+    area, height, leak = map(partial(CubicSpline, grid), np.array([of_gap(u, law) for u in grid]).T)
+    coat, _, skin = ref.table1_layers(100.0)
+
+    def rates(time: float, u: Any) -> Any:
+        """Rates of the voltages of gap and coating; the skin has the rest."""
+        e, gap = 180.0 * np.sin(2 * np.pi * 100.0 * time), abs(u[0])
+        every = np.array([u[0], u[1], e - u[0] - u[1]])
+        per = np.array([P.eps0 * P.eps_a / height(gap), coat.c, skin.c])
+        slope = np.sign(u[0]) * per * np.array([
+            area(gap, 1) - area(gap) * height(gap, 1) / height(gap), *(2 * [area(gap, 1)])
+        ])  # fmt: skip
+        lost = every * np.array([leak(gap), *(1.0 / x.r_total + area(gap) / x.r_area for x in (coat, skin))])
+        # C_i u_i' + [mobile] C_i' u_gap' u_i + lost_i is one current i.
+        matrix = np.zeros((4, 4))
+        matrix[:3, :3], matrix[:3, 3], matrix[3, :3] = np.diag(per * area(gap)), -1.0, 1.0
+        matrix[:3, 0] += slope * every if charge_law == "mobile" else 0.0
+        drive = 180.0 * 2 * np.pi * 100.0 * np.cos(2 * np.pi * 100.0 * time)
+        return np.linalg.solve(matrix, np.append(-lost, drive))[:2]
+
+    found = solve_ivp(rates, (0.0, t[-1]), [0.0, 0.0], "DOP853", t, rtol=1e-11, atol=1e-9)
+    assert np.abs(run.u_gap - found.y[0]).max() <= max(run.error.u_gap, 1e-8 * np.abs(run.u_gap).max())
+    expected = np.array([of_gap(u, law) for u in run.u_gap])
+    np.testing.assert_allclose(run.area, expected[:, 0], rtol=1e-9)
+    pull = 0.5 * P.eps0 * P.eps_a * (run.u_gap / expected[:, 1]) ** 2 * expected[:, 0]
+    np.testing.assert_allclose(run.f_el, pull, rtol=1e-9, atol=1e-12)
+    periodic = fs.steady_state(circuit, rtol=1e-7, charge_law=charge_law).solution
+    assert periodic.method == "radau"
+    long = fs.simulate(circuit, t_stop=0.21, t_eval=0.2 + periodic.t, rtol=1e-9, charge_law=charge_law)
+    assert np.abs(long.u_gap - periodic.u_gap).max() <= periodic.error.u_gap + long.error.u_gap
+
+
+@pytest.mark.filterwarnings("ignore:.*usual range")
+def test_a_stiff_gap_and_an_r_that_hardly_follows_are_table_1() -> None:
+    plain = fs.simulate(table1(), rtol=1e-8)
+    rigid = {"Xgap.law": "pullin", "Xgap.u0": 1e-8, "Xgap.p_ref": P.force_normal / ref.area(0.0, P)}
+    for changes, near in ((rigid, 3e-3), ({"Xgap.r_exp": 1e-6}, 1e-6)):
+        run = fs.simulate(table1().replace(changes), rtol=1e-8)
+        np.testing.assert_allclose(run.u_gap, plain.u_gap, rtol=0.0, atol=near * np.abs(plain.u_gap).max())
+        for held in ("frozen", 35e-6):
+            one, other = (fs.simulate(c, area=held, rtol=1e-8) for c in (table1(), table1().replace(changes)))
+            np.testing.assert_allclose(other.f_el, one.f_el, rtol=0.0, atol=1e-6 * one.f_el.max())
+
+
+def test_a_phasor_of_a_closing_gap_has_its_height_at_the_rms_voltage() -> None:
+    found = fs.phasor(table1(f=100.0).replace({"Xgap.law": "pullin"}), 100.0)
+    u = float(abs(found.u_gap[0]))
+    h, area = closing(u / np.sqrt(2.0))
+    assert found.area[0] == pytest.approx(area, rel=1e-9)
+    assert found.f_el_mean[0] == pytest.approx(0.25 * P.eps0 * P.eps_a * (u / h) ** 2 * area, rel=1e-9)
+    gains = ref.phasor_gains(100.0, area, ref.table1_layers(100.0, dataclasses.replace(P, d_a=h)))
+    assert u == pytest.approx(200.0 * abs(gains[1]), rel=1e-9)
+
+
+def test_pull_in_is_where_a_heights_voltage_is_largest_and_ends_a_run(tmp_path: Path) -> None:
+    soft = table1(f=100.0).replace({"Xgap.law": "pullin", "Xgap.u0": 2e-6})
+    heights = np.linspace(1.5e-6, 3.4e-6, 400)
+
+    def volts(h: float) -> float:
+        """The voltage at which a gap is in balance at this height."""
+        p, own = 14.3e3 * np.exp((P.d_a - h) / 2e-6), dataclasses.replace(P, d_a=h)
+        balance = lambda u: float(P.force_normal / ref.area(u, own) + 0.5 * P.eps0 * (u / h) ** 2 - p)  # noqa: E731
+        return brentq(balance, 0.0, h * np.sqrt(2.0 * p / P.eps0))
+
+    top = max(map(volts, heights))
+    for charge_law in ("local", "mobile"):
+        said = r"at [12]\.\d+ ms the gap voltage passes (\d+\.\d) V, .* of the contact law pullin are known: beyond it"
+        with pytest.raises(fs.InputError, match=said) as told:
+            fs.simulate(soft, charge_law=charge_law)
+        met = float(str(told.value).split("passes ")[1].split(" V")[0])
+        assert 0.989 * top <= met <= top
+    small = fs.simulate(soft.replace({"Vdrive.amplitude": 100.0}))
+    assert small.success
+    assert fs.load(small.to_netcdf(tmp_path / "run.nc")).f_el_mean == small.f_el_mean
+    assert pickle.loads(pickle.dumps(small)).f_el_mean == small.f_el_mean
+
+
+@pytest.mark.filterwarnings("ignore:.*usual range")
+@pytest.mark.parametrize(
+    ("changes", "act", "said"),
+    [
+        ({"Xgap.law": "pullin", "Xgap.a_fix": 35.0}, fs.simulate, "a gap that closes; allowed: a_fix=0 and tau=0"),
+        ({"Xgap.r_exp": 1.0, "Xgap.tau": 1e-3}, fs.simulate, "an r that follows its load; allowed: a_fix=0 and tau=0"),
+        (
+            {"Xgap.r_exp": 1.0},
+            fs.export_netlist,
+            "is not written for ngspice; allowed: another contact law, and r_exp=0",
+        ),
+        (
+            {"Xgap.law": "pullin"},
+            lambda c: fs.inverse_drive(c, force=fs.Sine(0.02, 20.0, offset=0.05)),
+            "that follows its",
+        ),
+        ({"Xgap.law": "pullin", "Xgap.p_ref": 1.0}, fs.simulate, "contact law pullin has no area above 0 at 0 V"),
+    ],
+)
+def test_soft_gaps_are_refused_where_they_cannot_be(changes: dict[str, Any], act: Any, said: str) -> None:
+    circuit = table1().replace(changes)
+    with pytest.raises(fs.InputError, match=said):
+        act(circuit)
 
 
 def test_two_fingers_of_a_network_each_have_their_law() -> None:
@@ -369,14 +502,16 @@ def test_a_law_has_sliders_and_a_deck_of_the_page() -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: table1(gap={"law": "dmd"}), "contact law is 'dmd'; allowed: jkr, dmt, linear"),
+        (lambda: table1(gap={"law": "dmd"}), "contact law is 'dmd'; allowed: jkr, dmt, linear, pullin"),
         (lambda: table1().replace({"Xgap.law": "dmt", "Xgap.m_exp": 1.0}), "Xgap m_exp is 1; allowed: more than 0"),
+        (lambda: table1().replace({"Xgap.r_exp": 11.0}), "Xgap r_exp is 11; allowed: 0 or more, from 1e-06 to 10"),
+        (lambda: fs.ContactLaw("own", pulled, gap=3.5e-6), "gap(u, p)"),  # type: ignore[arg-type]
         (lambda: fs.ContactLaw("own", pulled, ["k"]), "allowed: a mapping such as"),  # type: ignore[arg-type]
         (lambda: fs.ContactLaw("own", pulled, {"k": np.inf}), "allowed: a finite number"),
         (lambda: table1(gap={"law": "dmt"}), "GAP with law=dmt has no parameter"),
         (lambda: table1().replace({"Xgap.law": "tabor"}), "contact law is 'tabor'"),
         (lambda: table1().replace({"Xgap.law": "dmt", "Xgap.beta": 3.0}), "unknown parameter 'Xgap.beta'"),
-        (lambda: fs.ContactLaw("dmt", pulled), "allowed: a word but jkr, dmt, linear"),
+        (lambda: fs.ContactLaw("dmt", pulled), "allowed: a word but jkr, dmt, linear, pullin"),
         (lambda: fs.ContactLaw("own", pulled, {"fn": 1.0}), "a word in lower case but d, eps_r"),
         (lambda: fs.ContactLaw("own", 3.0), "allowed: a function area(u, p)"),  # type: ignore[arg-type]
         (lambda: fs.ContactLaw.from_table("t", [0.0, 1.0, 1.0], [1e-6] * 3), "is no function"),

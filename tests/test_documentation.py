@@ -329,7 +329,8 @@ def test_the_table_of_parameters_is_that_of_the_devices() -> None:
     table = {(device, row[1]): row[2:6] for row in rows("device") for device in row[0].split(", ")}
     assert table == expected
     assert all(row[6] for row in rows("device"))
-    others = {(s.least, s.most) for entry in DEVICES.values() for s in entry.parameters if s.name not in ("f", "n_cpe")}
+    own = "f", "n_cpe", "r_exp"
+    others = {(s.least, s.most) for entry in DEVICES.values() for s in entry.parameters if s.name not in own}
     frequency = DEVICES["SKIN"].parameter("f")
     assert others == {(1e-30, 1e30)}
     assert (frequency.least, frequency.most) == (parse_number("1m"), parse_number("1g"))

@@ -19,7 +19,7 @@ def test_every_number_of_a_row_is_within_its_bounds(n: int, row: Any) -> None:
     assert row.kind in evidence.VERDICTS
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 6, 7, 9, 15, 23])
+@pytest.mark.parametrize("n", [1, 2, 5, 6, 7, 9, 15, 18])
 def test_another_finger_is_outside_the_bounds(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
     other = {"Xgap.r": 3e6, "Xgap.d": 2e-6, "Xgap.c2": 2000.0}
     monkeypatch.setattr(evidence, "FINGER", evidence.FINGER.replace(other))

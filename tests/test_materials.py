@@ -149,6 +149,24 @@ def test_data_that_are_no_material_for_no_known_reason_are_warned_about_then_ref
         fs.fit_material(much)
 
 
+def test_a_cole_cole_material_is_exact_in_sweeps_and_near_in_time() -> None:
+    terms = (1e3, 1e-5, 0.2), (3e4, 2e-3, 0.1), (50.0, 1e-6, 0.0)
+    material, f = fs.ColeCole(4.0, terms, 1e-5), np.geomspace(10.0, 1e5, 9)
+    lines = *material.to_netlist("MINE").splitlines(), "Xm in 0 area MINE d=350u", "Varea area 0 35"
+    sweep = fs.phasor(deck("Vd in 0 AC 1", *lines), f)
+    s = 2j * np.pi * f
+    eps = 4.0 + sum(delta / (1.0 + (s * tau) ** (1.0 - alpha)) for delta, tau, alpha in terms)
+    # The last term's exponent is 1e-6 in place of 0.
+    np.testing.assert_allclose(sweep.impedance, 10.0 / (1e-5 + s * EPS0 * eps), rtol=2e-6)
+    run = fs.simulate(deck("Vd in 0 SIN(0 1 1k)", *lines, ".tran 10u 50m"), rtol=1e-8)
+    line = run.spectrum("i_source", highest=1500.0)
+    assert line.amplitude[np.argmin(np.abs(line.frequency - 1e3))] == pytest.approx(
+        1.0 / abs(fs.phasor(deck("Vd in 0 AC 1", *lines), 1e3).impedance[0]), rel=5e-3
+    )
+    with pytest.raises(fs.InputError, match="name is 'my skin'"):
+        material.to_netlist("my skin")
+
+
 def test_a_drift_too_small_for_a_refusal_is_told_from_noise() -> None:
     material = fs.ColeCole(10.0, ((1e4, 1e-3, 0.1), (100.0, 1e-6, 0.2)), 1e-4)
     y = material.admittivity(TABLE_F)

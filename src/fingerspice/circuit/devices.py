@@ -194,7 +194,7 @@ def _device(name: str, parameters: Iterable[dict[str, Any]] = (), **given: Any) 
 
 DEVICES = {one["name"]: _device(**one) for one in _DATA["device"]}  #: Every device that the reader knows, by name.
 #: Parameters of GAP that do not belong to the paper's contact law.
-OF_EVERY_LAW = ("d", "eps_r", "r", "fn", "mu", "a_fix", "tau", "p_sat", "slip", "v", "q", "n_cpe")
+OF_EVERY_LAW = ("d", "eps_r", "r", "fn", "mu", "a_fix", "tau", "p_sat", "slip", "v", "r_exp", "r_load", "q", "n_cpe")
 
 
 def called_devices() -> tuple[str, ...]:

@@ -42,6 +42,9 @@ class ContactLaw(Remembering):
     parameters : mapping of str to float, optional
         Own parameters with their defaults. Those of the paper's law (alpha, m_exp, beta, n_exp, c2) keep their units in
         decks, and are in SI units in `p`.
+    gap : callable, optional
+        ``gap(u, p)``: height of the gap, m, likewise; `d` by default. A gap whose height follows its voltage is run by
+        implicit steps.
 
     Raises
     ------
@@ -53,6 +56,7 @@ class ContactLaw(Remembering):
     name: str
     area: Callable[[FloatArray, Mapping[str, float]], ArrayLike]
     parameters: Mapping[str, float | ParameterSpec] = field(default_factory=dict)
+    gap: Callable[[FloatArray, Mapping[str, float]], ArrayLike] | None = None
 
     def __post_init__(self) -> None:
         require(isinstance(self.name, str), "the name of a contact law", repr(self.name), "a word")
@@ -60,6 +64,7 @@ class ContactLaw(Remembering):
         allowed = f"a word but {', '.join(_OWN)}"
         require(name.isidentifier() and name not in _OWN, "contact law", repr(self.name), allowed)
         require(callable(self.area), f"the area of {what}", repr(self.area), "a function area(u, p)")
+        require(self.gap is None or callable(self.gap), f"the gap of {what}", repr(self.gap), "a function gap(u, p)")
         mapping = isinstance(self.parameters, Mapping) and all(isinstance(own, str) for own in self.parameters)
         require(mapping, f"the parameters of {what}", repr(self.parameters), "a mapping such as {'k': 1.0}")
         object.__setattr__(self, "parameters", dict(self.parameters))
@@ -110,7 +115,7 @@ class ContactLaw(Remembering):
         from fingerspice.physics.contact import LawContact
 
         own = {name: v[name] for name in ("d", "eps_r", "fn", "mu", "p_sat", *self.parameters)}
-        return LawContact(v["d"], v["eps_r"], v["fn"], v["mu"], self.name, self.area, own, p_sat=v["p_sat"])
+        return LawContact(v["d"], v["eps_r"], v["fn"], v["mu"], self.name, self.area, own, self.gap, p_sat=v["p_sat"])
 
 
 def _of_table(table: Callable[[FloatArray], FloatArray], u: FloatArray, p: Mapping[str, float]) -> FloatArray:
@@ -138,6 +143,12 @@ _BELOW_1 = dataclasses.replace(DEVICES["GAP"].parameter("m_exp"), most=0.999)
 ContactLaw("dmt", laws.dmt, {"alpha": 54.4, "m_exp": _BELOW_1})
 _SLOPE = ParameterSpec("slope", "mm^2/N", 72.5, meaning="area per load")
 ContactLaw("linear", laws.linear, {"slope": _SLOPE, "a_max": ParameterSpec("a_max", "mm^2", 100.0, meaning="largest")})
+_GIVEN = ((name, DEVICES["GAP"].parameter(name)) for name in ("alpha", "m_exp", "beta", "n_exp", "c2"))
+_CLOSES = {
+    "u0": ParameterSpec("u0", "m", 0.5e-6, meaning="softness", least=1e-8),
+    "p_ref": ParameterSpec("p_ref", "Pa", 14.3e3, meaning="pressure at d"),
+}
+ContactLaw("pullin", laws.pullin, {**dict(_GIVEN), **_CLOSES}, laws.closing_gap)
 # Not by a name, but wherever the paper's law has a p_sat.
 _TWO_SCALES = ContactLaw("two_scales", laws.two_scales, dict.fromkeys(_PAPERS, 1.0))
 del LAWS["two_scales"]

@@ -128,14 +128,37 @@ class Network(Remembering):
 
     @cached_property
     def fingers(self) -> tuple[int, ...]:
-        """Indices of the areas that a GAP drives."""
-        return tuple(i for i, gap in enumerate(self.gaps) if gap is not None)
+        """Indices of the ridge areas that a GAP drives."""
+        return tuple(i for i, gap in enumerate(self.gaps) if gap is not None and not self.areas[i].own)
+
+    @property
+    def owned(self) -> bool:
+        """Whether a GAP's own capacitance or leak follows its voltage otherwise than its ridge area does."""
+        return any(area.own for area in self.areas)
 
     @cached_property
     def named_contacts(self) -> tuple[tuple[str, Contact], ...]:
         """Name and contact of each GAP."""
         found = ((self.areas[i].gap, self.contacts[i]) for i in self.fingers)
         return tuple((gap.name, contact) for gap, contact in found if gap is not None and contact is not None)
+
+    def held(self, area: float) -> FloatArray:
+        """All areas (n_area,) in m^2 where every ridge area is this one, and gaps and leaks are those at 0 V."""
+        rest, out = self.areas_at_rest, np.full(len(self.areas), area)
+        for i, one in enumerate(self.areas):
+            if one.own:
+                ridge = next(j for j, other in enumerate(self.areas) if other.gap is one.gap)
+                out[i] = rest[i] * (area / rest[ridge] if one.own == "closed" else 1.0)
+        return out
+
+    def pulled(self, finger: int, area: FloatArray) -> FloatArray:
+        """Area (m^2) on which the stress across a gap of height `d` gives a finger's force, from all areas (n_area,).
+
+        It is A (d/h)^2 where the gap closes to the height h.
+        """
+        own = self.areas[finger]
+        closed = (area[i] / area[finger] for i, a in enumerate(self.areas) if a.own == "closed" and a.gap is own.gap)
+        return np.asarray(area[finger] * next(closed, 1.0) ** 2)
 
     def capacitance(self, area: FloatArray) -> FloatArray:
         """Capacitance of every cell at areas (n_area,) in m^2, F, shape (n_cell,)."""
@@ -251,7 +274,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     return Network(
         sources=(*voltages, *currents), n_voltage=n_v, cells=tuple(cells), live=tuple(live),
         layers=tuple(e for e in branches if e.spec.is_layer), areas=areas,
-        contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
+        contacts=tuple(map(_contact, areas)),
         gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
         p=np.ascontiguousarray(across[:, :n]), q=np.hstack([across[:, n:], np.zeros((n_c, n_i))]),
         k=into[n_v:, :n], b=into[n_v:, n:], through=through, delivered=delivered,
@@ -259,6 +282,15 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
         node_names=tuple(written[name] for name in names),
         nodes=np.hstack([(at_e + at_r @ from_e)[:, order], at_r @ from_i]),
     )  # fmt: skip
+
+
+def _contact(area: Area) -> Contact | None:
+    if area.gap is None:
+        return None
+    contact, v = contact_of(area.gap), area.gap.values
+    if area.own == "closed":
+        return contact.closed()
+    return contact.leaking(v["r_exp"], v["r_load"]) if area.own else contact
 
 
 def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
@@ -269,7 +301,12 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
     # The nodes between an element's cells have names that no netlist can write.
     path = [a, *(f"{element.name.lower()} {i}" for i in range(1, len(constants))), b]
     on = place[area[0]] if area else None
+    if (closed := place.get(f"{area[0]} closed") if element.device == "GAP" else None) is not None:
+        on = closed
     cells = [Cell(element, ends, on, *own) for own, ends in zip(constants, pairwise(path), strict=False)]
+    if element.device == "GAP" and (leaking := place.get(f"{area[0]} leaking")) is not None:
+        leak = replace(element, name=f"{element.name}_r", device="R", nodes=(a, b), node_names=element.node_names[:2])
+        cells = [cells[0]._replace(g_total=0.0), Cell(leak, (a, b), leaking, 0.0, 0.0, cells[0].g_total)]
     return cells + (_cells(beside, place) if (beside := statespace.beside_gap(element)) is not None else [])
 
 
@@ -440,7 +477,7 @@ def phasor_areas(network: Network, mode: str | float, f: float, amplitude: float
 
     They are those of the gaps' rms voltages, unless `mode` is ``frozen`` or one area in m^2.
     """
-    area = network.areas_at_rest if isinstance(mode, str) else np.full(len(network.areas), mode)
+    area = network.areas_at_rest if isinstance(mode, str) else network.held(mode)
     if mode != "mean" or all(a.given is not None for a in network.areas):
         return area
     names, fingers = [e.name for e in network.layers], enumerate(zip(network.areas, network.contacts, strict=True))

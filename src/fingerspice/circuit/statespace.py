@@ -51,6 +51,8 @@ class Area(NamedTuple):
     node: str  # Canonical name of the area node
     gap: Element | None  # The GAP that drives it
     given: float | None  # m^2, from a DC source on the node or the gap's a_fix
+    # What follows it in place of a ridge area: the gap's own capacitance ("closed"), or its leak ("leaking")
+    own: str = ""
 
 
 def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
@@ -104,16 +106,16 @@ def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
     """The hops and the area of a stack, a circuit of one series loop of sources and layers, from ground to ground.
 
     None for any other circuit, for an area that follows with delay, and for a gap with a constant-phase element beside
-    it. Related circuits share the way round the loop.
+    it or with parts that do not follow its area. Related circuits share the way round the loop.
     """
 
     def make() -> tuple[tuple[Hop, ...], Area] | None:
         walked = circuit.related.remember(("hops",), lambda: _find_hops(circuit))
         if walked is None:
             return None
-        (area,) = shared(circuit, ("areas",), lambda: _areas(circuit))
+        area, *owned = shared(circuit, ("areas",), lambda: _areas(circuit))
         delayed = area.gap is not None and area.gap.values["tau"] > 0.0 and area.given is None
-        if delayed or (area.gap is not None and area.gap.values["q"] > 0.0):
+        if owned or delayed or (area.gap is not None and area.gap.values["q"] > 0.0):
             return None
         now = {e.name: e for e in circuit.elements}
         return tuple(hop._replace(element=now[hop.element.name]) for hop in walked), area
@@ -126,7 +128,7 @@ def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
     areas, branches = find_branches(circuit)
     at = _incidence(branches)
     of_stacks = all(e.device == "V" or e.spec.is_layer for e in branches)
-    if len(areas) != 1 or not of_stacks or max(map(len, at.values())) > 2:
+    if sum(not area.own for area in areas) != 1 or not of_stacks or max(map(len, at.values())) > 2:
         return None
     walks = []
     for start in at["0"]:
@@ -191,7 +193,19 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
             allowed = "allowed is a DC value above 0 (mm^2, from 1e-30 to 1e30) from the area node to 0"
             raise InputError(f"{on_node[0].name} drives an area: {allowed}", on_node[0].where)
         out.append(Area(node, owner, size * 1e-6 if size > 0.0 else None))
-    return tuple(reversed(out))
+    owned = (Area(f"{gap.nodes[2]} {own}", gap, None, own) for gap in owners.values() for own in owns(gap))
+    return (*reversed(out), *owned)
+
+
+def owns(gap: Element) -> tuple[str, ...]:
+    """Which parts of a GAP follow its voltage otherwise than its ridge area does; see `Area.own`."""
+    v, law = gap.values, acting_law(gap)
+    follows = {"closed": law is not None and law.gap is not None, "leaking": v["r_exp"] > 0.0}
+    found = tuple(own for own, does in follows.items() if does)
+    if found:
+        said = f"{gap.name} has {'a gap that closes' if 'closed' in found else 'an r that follows its load'}"
+        refuse(v["a_fix"] > 0.0 or v["tau"] > 0.0, f"{said}; allowed: a_fix=0 and tau=0", gap)
+    return found
 
 
 def _incidence(branches: list[Element]) -> dict[str, list[Element]]:

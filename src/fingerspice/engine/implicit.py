@@ -412,11 +412,21 @@ def _move(c: Nodal, t: float, h: float, stop: float, last: bool) -> None:
 
 
 @jit
+def _beyond(c: Nodal) -> int:
+    """Number of gaps whose voltage has passed the largest one of their areas' curves."""
+    count = 0
+    for i in range(c.peaks.size):
+        if c.net.gap[i] >= 0 and c.peaks[i] > c.net.curves[i, 1]:
+            count += 1
+    return count
+
+
+@jit
 def advance(c: Nodal, t_end: float) -> int:
     """Step a network to `t_end` (s) through the segments of its sources, writing outputs on the way.
 
     Returns DONE; JUMP: a source jumps at the time reached, and the caller must apply the jump first; STEP_UNDERFLOW; or
-    PAUSED: call again.
+    PAUSED: call again, unless a gap's voltage has passed the end of its contact law.
     """
     c = borrow(c)
     work, control, counters, sign = c.work, c.control, c.counters, c.sign
@@ -461,13 +471,14 @@ def advance(c: Nodal, t_end: float) -> int:
             dense_polynomial(work.k, c.scheme.dense, h, work.poly)
             last = False
         flips = 0
+        beyond = _beyond(c)
         _move(c, t, h, stop, last)
         if which >= 0 and theta <= 1.0:
             sign[which] = -sign[which]
             counters[ZEROS] += 1
         control[H] = max(proposed, control[H]) if last and h < control[H] else proposed
         h_before = h
-        if counters[ACCEPTED] + counters[REJECTED] >= pause and not c.jump:
+        if (counters[ACCEPTED] + counters[REJECTED] >= pause or _beyond(c) > beyond) and not c.jump:
             control[BEFORE] = h_before
             return PAUSED
     return DONE

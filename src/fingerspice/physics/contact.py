@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -73,9 +73,33 @@ class Contact:
         """Ridge contact area in full slip, A_R, m^2, at gap voltage `u_gap` (V)."""
         raise NotImplementedError
 
+    def given(self, u: FloatArray) -> FloatArray:
+        """Areas at gap voltages of 0 V or more, (n,); NaN where there is none."""
+        return self.area(u)
+
+    def height(self, u_gap: ArrayLike) -> FloatArray | float:
+        """Gap height, m, at gap voltage `u_gap` (V): `d`, unless the contact law says otherwise."""
+        return self.d
+
+    @property
+    def per_volt(self) -> float:
+        """Electroadhesive stress across a gap of height `d` at 1 V, Pa."""
+        return float(0.5 * EPS0 * self.eps_r / self.d**2)
+
     def stress(self, u_gap: ArrayLike) -> FloatArray:
         """Electroadhesive stress sigma_el (Eq. 2), Pa, at gap voltage `u_gap` (V)."""
-        return np.asarray(0.5 * EPS0 * self.eps_r / self.d**2 * np.asarray(u_gap, float) ** 2)
+        return np.asarray(self.per_volt * np.asarray(u_gap, float) ** 2 * (self.d / self.height(u_gap)) ** 2)
+
+    def closed(self) -> LawContact:
+        """The ridge area times `d` over the gap height, with which the gap's own capacitance and leak scale."""
+        return self._followed(partial(_closed, self))
+
+    def leaking(self, exponent: float, load: float) -> LawContact:
+        """The gap's conductance over that under a normal force `load` (N): its force over that, to this power."""
+        return self._followed(partial(_leaking, self, exponent, load))
+
+    def _followed(self, function: Callable[[FloatArray, Mapping[str, float]], ArrayLike]) -> LawContact:
+        return LawContact(self.d, self.eps_r, self.f_n, self.mu, "of the GAP", function, {})
 
     def reach(self, u_max: float) -> float:
         """The gap voltage (V) up to which there is an area, at most `u_max`."""
@@ -88,6 +112,14 @@ class Contact:
         stays smooth.
         """
         raise NotImplementedError
+
+
+def _closed(contact: Contact, u: FloatArray, _: Mapping[str, float]) -> FloatArray:
+    return contact.given(u) * contact.d / contact.height(u)
+
+
+def _leaking(contact: Contact, exponent: float, load: float, u: FloatArray, _: Mapping[str, float]) -> FloatArray:
+    return np.asarray(((contact.f_n + contact.stress(u) * contact.given(u)) / load) ** exponent)
 
 
 @dataclass(frozen=True)
@@ -184,11 +216,19 @@ class LawContact(Contact):
         Ridge area, m^2, shape (n,), at gap voltages of 0 V or more, shape (n,), and with `values`.
     values : mapping
         Its parameters by name.
+    gap : callable, optional
+        Gap height, m, likewise; `d` by default.
     """
 
     law: str
     function: Callable[[FloatArray, Mapping[str, float]], ArrayLike]
     values: Mapping[str, float]
+    gap: Callable[[FloatArray, Mapping[str, float]], ArrayLike] | None = None
+
+    def height(self, u_gap: ArrayLike) -> FloatArray | float:
+        """As of a `Contact`."""
+        u = np.abs(np.asarray(u_gap, float))
+        return self.d if self.gap is None else np.asarray(self.gap(u.ravel(), dict(self.values))).reshape(u.shape)
 
     def given(self, u: FloatArray) -> FloatArray:
         """The function's areas at gap voltages of 0 V or more, (n,); NaN for those that are no positive number."""
@@ -223,6 +263,8 @@ class LawContact(Contact):
     def ends(self, known: float) -> str:
         """The message about a gap voltage (V) that passes the largest one whose areas are known."""
         said = f"the gap voltage passes {known:.4g} V, up to which areas of the contact law {self.law} are known"
+        if self.gap is not None:
+            said = f"{said}: beyond it the gap closes (pull-in)"
         return f"{said}; allowed: a smaller source, or a law that reaches further"
 
     def reach(self, u_max: float) -> float:
@@ -326,6 +368,15 @@ def ridge_area_array(u: FloatArray, contact: FloatArray) -> FloatArray:
     out = np.empty_like(u)
     for i in range(u.size):
         out[i] = ridge_area(u[i], contact)
+    return out
+
+
+@jit
+def ridge_area_rows(u: FloatArray, contacts: FloatArray) -> FloatArray:
+    """`ridge_area` over an array, shape (n,), each with its own contact, shape (n, 8)."""
+    out = np.empty_like(u)
+    for i in range(u.size):
+        out[i] = ridge_area(u[i], contacts[i])
     return out
 
 

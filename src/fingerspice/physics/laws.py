@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from fingerspice.physics.materials import EPS0
 if TYPE_CHECKING:
     from fingerspice.physics.contact import Contact
 
-Values = Mapping[str, float]
+Values = Mapping[str, Any]
 _FRICTION = math.sqrt(math.pi / 8.0)  # Over mu p_sat A_real, by which it is mu times the load where A_real is small
 
 
@@ -105,3 +106,69 @@ def two_scales(u: FloatArray, v: Values) -> FloatArray:
 
     loss = v["c2"] * (_FRICTION * np.asarray(v["mu"])) ** 2
     return root(missing, 1e-9 * adhesive, adhesive, adhesive, stress(u, v), v["fn"], loss, v["p_sat"])
+
+
+_PAPERS = ("d", "eps_r", "fn", "mu", "alpha", "m_exp", "beta", "n_exp", "c2")
+
+
+def paper(u: FloatArray, v: Values) -> FloatArray:
+    """Eqs. 1 to 4 at values that may differ from one gap voltage to the next."""
+    from fingerspice.physics.contact import ridge_area_rows
+
+    x, at_rest = paper_constants(v)
+    m, n, mu = (np.asarray(v[name]) for name in ("m_exp", "n_exp", "mu"))
+    own = x, at_rest, 1.0 / m, 0.5 * (1.0 + 1.0 / m - 1.0 / n), stress(np.ones(1), v), v["fn"], mu, v["c2"] * mu**2
+    *rows, u = np.broadcast_arrays(*own, u)
+    return np.asarray(ridge_area_rows(u.ravel(), np.stack([row.ravel() for row in rows], axis=1)).reshape(u.shape))
+
+
+_CLOSING = (*_PAPERS, "u0", "p_ref")
+
+
+def closing_gap(u: FloatArray, v: Values) -> FloatArray:
+    """Height of a gap whose asperities carry the pressure p = p_ref exp((d - h)/u0) at height h (Persson 2007).
+
+    It is the largest root of F_N/A + sigma = p, with the paper's area under the attraction across that height. Beyond
+    pull-in, where the attraction grows faster than the pressure as the gap closes, there is none.
+    """
+    values = [np.atleast_1d(np.asarray(v[name], float)) for name in _CLOSING]
+    rest, closed = _heights(tuple(tuple(value.tolist()) for value in values))
+    with np.errstate(all="ignore"):
+        # A ridge area that grows at first takes pressure off the gap, which then opens a little.
+        return root(_pressure_left, closed, rest + values[-2], u, *values)
+
+
+def _pressure_left(h: FloatArray, u: FloatArray, *values: FloatArray) -> FloatArray:
+    own = dict(zip(_CLOSING, values, strict=True))
+    here, pressure = {**own, "d": h}, own["p_ref"] * np.exp((own["d"] - h) / own["u0"])
+    return np.asarray(pressure - own["fn"] / paper(u, here) - stress(u, here))
+
+
+@lru_cache(maxsize=32)
+def _heights(values: tuple[tuple[float, ...], ...]) -> tuple[FloatArray, FloatArray]:
+    """Height without voltage, and the one at pull-in: of each height's voltage, the largest has it."""
+    from scipy.optimize.elementwise import find_minimum
+
+    def less_voltage(h: FloatArray, *values: FloatArray) -> FloatArray:
+        own = dict(zip(_CLOSING, values, strict=True))
+        alone = h * np.sqrt(2.0 * own["p_ref"] / (EPS0 * own["eps_r"])) * np.exp(0.5 * (own["d"] - h) / own["u0"])
+        return -root(lambda u, h, *values: _pressure_left(h, u, *values), 0.0, alone, h, *values)
+
+    given = [np.array(value) for value in values]
+    own = dict(zip(_CLOSING, given, strict=True))
+    with np.errstate(all="ignore"):
+        rest = own["d"] + own["u0"] * np.log(own["p_ref"] * paper(np.zeros(1), own) / own["fn"])
+        # Not so far down that the pressure is e^200 times that of the reference.
+        lowest = np.maximum(0.01 * rest, own["d"] - 200.0 * own["u0"])
+        heights = lowest + (rest - lowest) * np.linspace(1.0, 0.0, 65)[:, None]
+        # At rest the voltage is 0, to which rounding adds.
+        tried = np.vstack([np.zeros((1, rest.size)), less_voltage(heights[1:], *given)])
+        low = np.clip(np.argmin(tried, axis=0), 1, 63)
+        nearest = tuple(np.take_along_axis(heights, low[None] + k, 0)[0] for k in (1, 0, -1))
+        found = find_minimum(less_voltage, nearest, args=tuple(given))
+        return rest, np.where(found.success, found.x, heights[-1])
+
+
+def pullin(u: FloatArray, v: Values) -> FloatArray:
+    """The paper's area with a gap that closes under load."""
+    return paper(u, {**v, "d": closing_gap(u, v)})

@@ -353,7 +353,8 @@ class Record(Signals):
 
     @cached_property
     def u_gap(self) -> FloatArray | None:
-        return side_by_side([self.cell_voltage(gap) for gap in self.network.gaps if gap is not None])
+        cells = (self.network.gaps[i] for i in self.network.fingers)
+        return side_by_side([self.cell_voltage(cell) for cell in cells if cell is not None])
 
     @cached_property
     def area(self) -> FloatArray | None:
@@ -365,10 +366,11 @@ class Record(Signals):
         """Electroadhesive force (Eq. 2 times A_R), N."""
         out = []
         for i, (_, contact), u in zip(self.network.fingers, self.fingers, self.each("u_gap"), strict=True):
-            if self.net.gap[i] >= 0 and self.net.slow[i] < 0:
+            if self.net.gap[i] >= 0 and self.net.slow[i] < 0 and not self.network.owned:
                 out.append(forces(u, self.net.curves[i], float(contact.stress(1.0))))
             else:
-                out.append(np.asarray(contact.stress(u) * self._area_of(i)))
+                every = np.array([self._area_of(j) for j in range(self.net.gap.size)])
+                out.append(contact.per_volt * u**2 * self.network.pulled(i, every))
         return side_by_side(out)
 
     @cached_property

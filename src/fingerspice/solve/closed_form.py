@@ -163,7 +163,7 @@ def _state_errors(problem: Problem, run: Run, bound: float) -> None:
         place, peak = record.network.fingers[i], max(float(u.max(initial=0.0)), -float(u.min(initial=0.0)))
         if record.net.gap[place] < 0 and record.net.slow[place] < 0:
             # The area is fixed: the force grows with the voltage.
-            force = float(record.fingers[i][1].stress(peak) * record.net.area0[place])
+            force = record.fingers[i][1].per_volt * peak**2 * float(record.network.pulled(place, record.net.area0))
         else:
             force = float(record.each("f_el")[i].max(initial=0.0))
         share = 2.0 * rounding / (peak or math.inf) + 3.0 * bound

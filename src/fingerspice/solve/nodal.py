@@ -22,6 +22,7 @@ import numpy as np
 from fingerspice.base.announcing import tell
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.errors import InputError
+from fingerspice.base.units import format_si
 from fingerspice.engine import implicit
 from fingerspice.engine.implicit import Nodal, advance, new_work
 from fingerspice.engine.network import Sources, new_room, ramp, rates_at
@@ -108,6 +109,8 @@ class Collocation(Integration):
         run = self.nodal(sources)
         while True:
             code = advance(run, t_end)
+            for i in self.problem.network.fingers:
+                runs.refuse_beyond_law(self.problem, i, float(self.peaks[i]), f"at {format_si(self.t, 's')} ")
             if code == implicit.DONE:
                 return Status.SUCCESS
             if code == implicit.PAUSED:

@@ -202,7 +202,7 @@ class Search(Period):
 
     def __init__(self, problem: Problem, rtol: float) -> None:
         super().__init__(problem)
-        problem, self.rtol, self.passes, self.implicit = self.problem, rtol, 0, False
+        problem, self.rtol, self.passes, self.implicit = self.problem, rtol, 0, self.problem.network.owned
         self.one: Track | March | None = None  # Integrates every pass by exponential steps
         # The gap voltage that a stack's area curve reaches, V; 0: that of its scene.
         self.top = 0.0

@@ -112,7 +112,7 @@ class Scene(Remembering):
     @cached_property
     def measured(self) -> tuple[int, ...]:
         """Cells for whose voltages errors are stated: the gaps, or without gaps the cell of smallest capacitance."""
-        gaps = tuple(gap for gap in self.network.gaps if gap is not None)
+        gaps = tuple(cell for cell in map(self.network.gaps.__getitem__, self.network.fingers) if cell is not None)
         if gaps or not self.network.cells:
             return gaps
         return (int(np.argmin(self.network.capacitance(self.net.area0))),)
@@ -132,7 +132,7 @@ def scene_of(
         # Each area (m^2), None for one that follows its gap, and the name of the area mode.
         fixed, mode = tuple(a.given for a in network.areas), str(area)
         if not isinstance(area, str):
-            fixed, mode = (float(area),) * len(fixed), f"{area:g} m^2"
+            fixed, mode = tuple(map(float, network.held(area))), f"{area:g} m^2"
         elif None not in fixed:
             mode = f"{fixed[0]:g} m^2 (from the deck)" if len(fixed) == 1 else "given by the deck" if fixed else "none"
         elif area != "coupled":

@@ -222,6 +222,8 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
         reasons += [REPEATS] if span / problem.network.waveform.period >= FEWEST_PERIODS else []
     if chosen == "linear" and model is not None and scene.coupled and np.any(model.rate0 > 0.0):
         needed = changed
+    if chosen == "coupled" and problem.network.owned:
+        reasons.append("the gap's height, or its leak, follows its voltage, which implicit steps take")
     if scene.skin is not None:
         f, error = scene.skin
         reasons.append(f"skin at {f:g} Hz: its dispersion moves the gap voltage by {error:.1g}")
@@ -357,6 +359,8 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
     if method == "auto" and (recorded := solve_recording(problem, rtol, progress)) is not None:
         return recorded, "relaxation"
     is_stack, reason = problem.network.stack is not None, ""
+    if problem.network.owned and problem.scene.coupled:
+        method = "radau"
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, progress, repeat=method == "auto")
         if run.status not in (BEYOND_STACKS if is_stack else BEYOND_NETWORKS) or (is_stack and method == "exponential"):

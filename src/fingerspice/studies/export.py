@@ -80,6 +80,8 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
                 raise InputError(f"{other} and {name} would be one name in the export; allowed: rename one of them")
     network = network_of(circuit)
     contacts = dict(network.named_contacts)
+    beyond = "a GAP whose height, or leak, follows its voltage is not written for ngspice"
+    refuse(network.owned, f"{beyond}; allowed: another contact law, and r_exp=0")
     areas = _start_areas(circuit, law, contacts)
     ratio = max((one.work_ratio for one in contacts.values() if isinstance(one, JkrContact)), default=1.0)
     lines = [circuit.title or "fingerspice export"]

@@ -155,8 +155,8 @@ def phasor(
             layers = np.array([network.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
             gain, size = layers[:, scene.gap], areas[:, scene.finger].copy()
             u_gap = gain * amplitude * np.exp(1j * phase)
-            stress = scene.contact.stress(np.abs(u_gap))
-            force = 0.5 * stress * size  # At a constant area the mean over a period of a sine is half the peak
+            force = scene.contact.per_volt * np.abs(u_gap) ** 2 * network.pulled(scene.finger, areas.T)
+            stress, force = force / size, 0.5 * force  # At a constant area a sine's mean is half the peak
             results = (layers, size, u_gap, force)[: 4 if math.isfinite(amplitude) else 2]
             warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
         impedance = np.array([network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)]) if alone else None

@@ -162,6 +162,30 @@ class ColeCole:
         eps = self.eps_inf + sum(delta / (1.0 + (s * tau) ** (1.0 - alpha)) for delta, tau, alpha in self.terms)
         return np.asarray(self.conductivity + s * EPS0 * eps)
 
+    def to_netlist(self, name: str) -> str:
+        """A subcircuit with the thickness as parameter, as `MaterialFit.to_netlist`, and exact in sweeps.
+
+        Each term is a slab in series with a constant-phase element, q = eps0 delta tau^(alpha - 1) and n_cpe = alpha.
+
+        Raises
+        ------
+        InputError
+            If the name is not allowed in a netlist.
+        """
+        rho = 1.0 / self.conductivity if self.conductivity > 0.0 else math.inf
+        lines = [f"X0 p n area SLAB d={{d}} eps_r={self.eps_inf!r} rho={rho!r}"]
+        for i, (delta, tau, alpha) in enumerate(self.terms, 1):
+            lines.append(f"Xe{i} p c{i} area SLAB d={{d}} eps_r={delta!r} rho=inf")
+            q = EPS0 * delta * tau ** (alpha - 1.0)
+            # With an exponent of 0 it is a resistor, which a constant-phase element is as well with almost none.
+            lines.append(f"Xq{i} c{i} n area CPE_LAYER q={{{q!r}/d}} n_cpe={max(alpha, 1e-6)!r}")
+        return _subcircuit(name, lines)
+
+
+def _subcircuit(name: str, lines: list[str]) -> str:
+    require(name.isidentifier(), "name", repr(name), "letters, digits and _, not first a digit")
+    return "\n".join([f".subckt {name} p n area params: d=350u", *lines, ".ends", ""])
+
 
 @dataclass(frozen=True)
 class Consistency:
@@ -229,14 +253,13 @@ class MaterialFit(Shown):
         InputError
             If the name is not allowed in a netlist.
         """
-        require(name.isidentifier(), "name", repr(name), "letters, digits and _, not first a digit")
         eps_r, rho = self.ladder.cells()
         nodes = ["p", *(f"c{i}" for i in range(1, eps_r.size)), "n"]
         lines = [
             f"X{i + 1} {nodes[i]} {nodes[i + 1]} area SLAB d={{d}} eps_r={eps:.10g} rho={resistivity:.10g}"
             for i, (eps, resistivity) in enumerate(zip(eps_r, rho, strict=True))
         ]
-        return "\n".join([f".subckt {name} p n area params: d=350u", *lines, ".ends", ""])
+        return _subcircuit(name, lines)
 
     def plot(self) -> drawing.Picture:
         """Resistivity and permittivity of the data and of the ladder, and the misfit, against frequency."""
