@@ -23,7 +23,11 @@ import xarray
 import fingerspice as fs
 from commands import QUICK, Command, Result, tree
 from deck_edits import edited
+from fingerspice.circuit.devices import DEVICES
+from fingerspice.circuit.laws import LAWS
 from fingerspice.cli.terminal import COMMON, FIGURES, OWN
+from fingerspice.netlist.expressions import FUNCTIONS
+from fingerspice.netlist.reader import DIRECTIVES
 from fingerspice.results.runfile import create
 from scenes import CIRCUITS, listed, shipped
 
@@ -210,13 +214,25 @@ def test_export_writes_one_deck_with_the_changes_in_it(command: Command) -> None
     assert "* fingerspice_mobile.lib - " in Path("sub/y.cir").read_text()
 
 
-@pytest.mark.parametrize("name", ["run", "ac", "compare", "export", "figures", "explore", "sets", "check"])
+@pytest.mark.parametrize("name", ["run", "ac", "compare", "export", "figures", "explore", "sets", "help-deck", "check"])
 def test_help_of_every_command_shows_an_example(command: Command, name: str) -> None:
     for flag in ("--help", "-h"):
         result = command(name, flag)
         assert result.code == 0
         assert f"fingerspice {name} " in result.out.partition("Example")[2]
     assert command("--version") == Result(0, f"fingerspice {fs.__version__}\n", "")
+
+
+def test_help_deck_lists_every_registry(command: Command) -> None:
+    text, kinds = command("help-deck").out, json.loads(command("help-deck", "--json").out)["vocabulary"]
+    rows = {tuple(re.findall(r"[\w]+", row)): row for row in kinds["elements and devices"]}
+    for device in DEVICES.values():
+        (words,) = (words for words in rows if device.name in words)
+        assert {p.name for p in device.parameters if device.cells} <= set(words)
+        assert device.what in rows[words]
+    for known in (DIRECTIVES, FUNCTIONS, LAWS, *kinds.values()):
+        assert all(word in text for word in known)
+    assert "PULSE(V1 V2 TD TR TF PW PER)" in kinds["sources"]
 
 
 def test_ac_with_the_area_coupled_sweeps_amplitudes_too(command: Command) -> None:

@@ -163,6 +163,12 @@ def test_gaps_that_close_and_leaks_that_follow_obey_kirchhoffs_law(
     assert np.abs(long.u_gap - periodic.u_gap).max() <= periodic.error.u_gap + long.error.u_gap
 
 
+def test_the_load_of_r_is_that_of_the_finger_unless_given() -> None:
+    one, other = ({"Xgap.r_exp": 1.0, "Xgap.fn": 1.0, **more} for more in ({}, {"Xgap.r_load": 0.5, "Xgap.r": 2e6}))
+    runs = [fs.simulate(table1().replace(changes), rtol=1e-8) for changes in (one, other)]
+    np.testing.assert_allclose(runs[0].u_gap, runs[1].u_gap, rtol=0.0, atol=1e-6)
+
+
 @pytest.mark.filterwarnings("ignore:.*usual range")
 def test_a_stiff_gap_and_an_r_that_hardly_follows_are_table_1() -> None:
     plain = fs.simulate(table1(), rtol=1e-8)

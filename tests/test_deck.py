@@ -272,6 +272,91 @@ def test_a_value_that_is_the_same_inside_is_taken(tmp_path: Path) -> None:
     assert ours(body) == theirs(body, tmp_path) == 56.0
 
 
+@pytest.mark.parametrize(("body", "expected"), [
+    (".func par(a, b) {a*b/(a+b)}\nR1 a 0 {par(1k, 3k)}", 750.0),
+    (".func area(l,w) '(l + 1) * w'\n.func twice(x) 2*x\nR1 a 0 {twice(area(2, twice(3)))}", 36.0),
+    # Arguments are whole values: 3*(1+1), not 3*1+1; and the body has the parameters of the deck.
+    (".param k=3\n.func times(x) {k*x}\nR1 a 0 {times(1+1)}", 6.0),
+    (".func late(x) {x*n}\n.param m={late(2)} n=5\nR1 a 0 {m}", 10.0),
+])  # fmt: skip
+def test_functions_have_the_values_of_ngspice(tmp_path: Path, body: str, expected: float) -> None:
+    assert ours(body) == expected
+    # ngspice 39 takes parameters in the order of their lines.
+    if "late" not in body:
+        assert theirs(body, tmp_path) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(("lines", "message", "place"), [
+    ((".func a(x) {b(x)}", ".func b(x) {a(x)}"), "functions refer to each other in a circle: a -> b -> a", (2, 13)),
+    ((".func a(x) {a(x-1)}",), "functions refer to each other in a circle: a -> a", (2, 13)),
+    ((".func sin(x) {x}",), "function 'sin' is built in; allowed: another name", (2, 7)),
+    ((".func q(x,x) {x}",), "an argument of q is 'x'; allowed: names, each once", (2, 6)),
+    ((".func q(1) {2}",), "an argument of q is '1'", (2, 6)),
+    ((".func q {x}",), "write .func name(x, y) {x*y}", (2, 6)),
+    ((".func q(x) {x*+}",), "a value is missing at the end", (2, 17)),
+    ((".func q(x) {x}", ".func Q(y) {y}"), "function 'q' is defined twice", (3, 1)),
+    ((".func q(x) {x}", "R1 a 0 {q(1, 2)}"), "q takes 1 argument, 2 given", (3, 9)),
+    ((".func par(x) {x}", "R1 a 0 {parr(1)}"), "'parr' is not a function; did you mean 'par'?", (3, 9)),
+    ((".func q(x) {x*zz}", "R1 a 0 {q(1)}"), "in q of <netlist>:2:13: parameter 'zz' is not defined", (3, 9)),
+    ((".global",), "write .global node node ...", (2, 1)),
+    ((".endl",), ".endl without its .lib: a section is read by .lib FILE SECTION", (2, 1)),
+])  # fmt: skip
+def test_functions_and_shared_nodes_that_mean_nothing_are_refused(
+    lines: tuple[str, ...], message: str, place: tuple[int, int]
+) -> None:
+    error = refusal(*lines)
+    assert message in error.message
+    assert error.where == Where("<netlist>", *place)
+
+
+def test_functions_of_functions_cannot_take_for_ever() -> None:
+    lines = [f".func f{i}(x) {{f{i - 1}(x) + f{i - 1}(x)}}" for i in range(1, 30)]
+    assert "makes 1,023, 10 deep; allowed: 1,000, 25 deep" in refusal(".func f0(x) {x}", *lines).message
+    lines = [f".func f{i}(x) {{f{i - 1}(x)}}" for i in range(1, 30)]
+    assert "makes 26, 26 deep; allowed: 1,000, 25 deep" in refusal(".func f0(x) {x}", *lines).message
+
+
+def test_a_shared_node_is_the_same_in_every_subcircuit(tmp_path: Path) -> None:
+    lines = (
+        ".global Vcc",
+        ".subckt inner o",
+        "R2 vcc o 2",
+        ".ends",
+        ".subckt cell o",
+        "X2 o inner",
+        ".ends",
+        "X1 a cell",
+    )
+    assert only(*lines).nodes == ("vcc", "a")
+    # A port of that name is the caller's node.
+    assert only(".global vcc", ".subckt cell vcc", "R2 vcc 0 2", ".ends", "X1 a cell").nodes == ("a", "0")
+    body = "\n".join((".global a", ".subckt cell o", "R2 a o 2", ".ends", "X1 0 cell"))
+    assert theirs(body, tmp_path) == 2.0
+
+
+def test_a_section_of_a_library_is_read_alone(tmp_path: Path) -> None:
+    path = tmp_path / "main.cir"
+    (tmp_path / "p.lib").write_text(
+        ".lib fast\n.param r=5\n.endl\n.LIB Slow\n.param r=7\n.endl slow\n.lib open\nR9 a 0 1\n"
+    )
+    path.write_text("t\n.lib p.lib fast\nR1 a 0 {r}\n")
+    with pytest.raises(InputError, match=r"section 'open' of the library has no \.endl"):
+        parse_deck(*text_of(path))
+    (tmp_path / "p.lib").write_text("* two\n.lib fast\n.param r=5\n.endl\n.LIB Slow\n.param r=7\n.endl slow\n")
+    for section, expected in (("fast", 5.0), ("SLOW", 7.0)):
+        path.write_text(f"t\n.lib 'p.lib' {section}\nR1 a 0 {{r}}\n")
+        assert value(parse_deck(*text_of(path)).statements[0].body[0]) == expected
+        assert theirs(f".lib 'p.lib' {section}\nR1 a 0 {{r}}", tmp_path) == expected
+    for line, said in (
+        (".lib p.lib slo", "the library has no section 'slo'; did you mean 'slow'?"),
+        (".lib p.lib xyz", "the library has no section 'xyz'; its sections are fast, slow"),
+        (".lib p.lib", "'fast' begins a section of a library; allowed: .lib FILE SECTION, which reads one"),
+    ):
+        path.write_text(f"t\n{line}\nR1 a 0 1\n")
+        with pytest.raises(InputError, match=re.escape(said)):
+            parse_deck(*text_of(path))
+
+
 def test_local_files_are_included_and_named_in_places(tmp_path: Path) -> None:
     path = tmp_path / "main.cir"
     path.write_text("t\n.inc 'my parts.lib'\nR1 a 0 {r}\n")

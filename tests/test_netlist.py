@@ -44,7 +44,7 @@ def test_the_papers_deck_is_its_devices_and_its_parameters() -> None:
     assert dict(circuit["Xskin"].values) == {"d": 350e-6, "f": 100.0}
     gap = {"d": 3.5e-6, "eps_r": 1.0, "r": 1e6, "fn": 0.5, "mu": 0.3, "alpha": 54.4, "m_exp": 0.52}
     gap |= {"beta": 32.0, "n_exp": 1.41, "c2": 5000.0, "a_fix": 0.0, "tau": 0.0, "p_sat": math.inf}
-    assert dict(circuit["Xgap"].values) == gap | dict.fromkeys(("slip", "v", "q", "n_cpe"), 0.0)
+    assert dict(circuit["Xgap"].values) == gap | dict.fromkeys(("slip", "v", "r_exp", "r_load", "q", "n_cpe"), 0.0)
     assert circuit["xGAP"].nodes == ("top", "skin", "area")
     assert circuit.title == "Fingerpad"
     assert circuit.warnings == circuit.unused == ()

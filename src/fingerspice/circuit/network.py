@@ -290,7 +290,7 @@ def _contact(area: Area) -> Contact | None:
     contact, v = contact_of(area.gap), area.gap.values
     if area.own == "closed":
         return contact.closed()
-    return contact.leaking(v["r_exp"], v["r_load"]) if area.own else contact
+    return contact.leaking(v["r_exp"], v["r_load"] or v["fn"]) if area.own else contact
 
 
 def _cells(element: Element, place: dict[str, int]) -> list[Cell]:

@@ -6,6 +6,7 @@ import gc
 import json
 import signal
 import sys
+import textwrap
 import time
 from collections.abc import Callable
 from functools import partial
@@ -362,6 +363,23 @@ def sets(
     job.give(lambda: str(found))
 
 
+def help_deck(job: Job) -> None:
+    """List all that a deck may say: elements, devices and their parameters, sources, directives, measures, functions.
+
+    Example:
+      fingerspice help-deck
+    """
+    from fingerspice.netlist.sources import vocabulary
+
+    found = vocabulary()
+    job.answer.update(vocabulary=found)
+    # Short words stand beside one another.
+    kinds = {
+        kind: rows if max(map(len, rows)) > 24 else textwrap.wrap("  ".join(rows), 100) for kind, rows in found.items()
+    }
+    job.give(lambda: "\n".join(x for kind, rows in kinds.items() for x in (f"{kind}:", *(f"  {row}" for row in rows))))
+
+
 def check(
     job: Job, store: Annotated[Path, Argument(metavar="STORE", help="Folder that run --stream or sweep --store wrote.")]
 ) -> None:
@@ -396,6 +414,7 @@ _COMMANDS: dict[Callable[..., None], str] = {
     figures: "out only gallery json",
     explore: "deck set finger coating drive port no_browser static json",
     sets: "name json",
+    help_deck: "json",
     check: "store json",
 }
 for _function, _options in _COMMANDS.items():

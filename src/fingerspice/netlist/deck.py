@@ -15,7 +15,7 @@ from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, called_devices
-from fingerspice.netlist.expressions import Bare, Call, Number, Scope, Value
+from fingerspice.netlist.expressions import Bare, Call, Number, Scope, Value, in_scope
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
 from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, OTHERS, Deck, Statement, Subcircuit
 from fingerspice.netlist.sources import SOURCES
@@ -50,7 +50,7 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
         deck.warn(problem, Where(deck.file, 1))
     try:
         deck.read_lines(lines)
-        scope = Scope(deck.root.params)
+        scope = Scope(deck.root.params, functions=in_scope(deck.functions))
         deck.params = scope.solve()
         _Instance(deck, deck.root, scope).expand()
     except InputError as error:
@@ -86,6 +86,8 @@ class _Instance:
         lower = name.lower()
         if lower in ("0", "gnd"):
             return "0", name
+        if lower in self.deck.shared and lower not in self.ports:
+            return lower, self.deck.shared[lower]
         return self.ports.get(lower) or (f"{self.prefix}{lower}".lower(), f"{self.prefix}{name}")
 
     def nodes(self, words: list[Lexeme]) -> list[tuple[str, str]]:

@@ -16,7 +16,8 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import lru_cache, partial
 from graphlib import CycleError, TopologicalSorter
-from typing import Literal, NamedTuple, TypeAlias
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number, spice_text, suspicious_mega
@@ -24,6 +25,7 @@ from fingerspice.netlist.lexer import Assignment, Group, Lexeme, Line, nearest
 from fingerspice.waveforms.waveform import refuse
 
 MAX_LENGTH, MAX_DEPTH, MAX_QUESTIONS, MAX_SIGNS = 2000, 25, 25, 3  #: Characters, brackets, `?`, signs in a row.
+MAX_CALLS = 1000  #: Of the deck's functions in one expression's function.
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
 #: Function from the values of parameters, whose names are in lower case, to the value of a part of an expression.
@@ -106,6 +108,7 @@ class Expression:
         _refuse(len(text) > MAX_LENGTH, f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
         self.text = text
         self.names: dict[str, int] = {}  # In lower case, constants included, and the position of each one's first use
+        self.calls: list[str] = []  # Functions that are not in `FUNCTIONS`, once for each call
         self.mega: tuple[str, int] | None = None  # The first number written with a capital M, and its position
         self._pieces: list[_Piece] = []
         self._at = questions = 0
@@ -225,8 +228,8 @@ class Expression:
             self.names.setdefault(name, position)
             return partial(_looked_up, piece)
         if name not in FUNCTIONS:
-            hint = nearest(text, FUNCTIONS) or f"; functions are {' '.join(FUNCTIONS)}"
-            raise Problem(f"'{text}' is not a function{hint}", position)
+            self.calls.append(name)
+            return partial(_defined, piece, self._in_brackets(True))
         return partial(_called, name, self._in_brackets(True), self.text)
 
     def _in_brackets(self, of_call: bool) -> list[Term]:
@@ -273,6 +276,71 @@ def _called(name: str, arguments: list[Term], text: str, names: Mapping[str, flo
     return float(function(*(argument(names) for argument in arguments)))
 
 
+class DeckFunction(NamedTuple):
+    """A function of a `.func` line, whose body may have the deck's parameters; scopes have it as ``name(``."""
+
+    name: str  # Lower case, as the arguments
+    arguments: tuple[str, ...]
+    body: Lexeme
+
+
+def _defined(piece: _Piece, arguments: list[Term], names: Mapping[str, Any]) -> float:
+    name = piece.text.lower()
+    function: DeckFunction | None = names.get(f"{name}(")
+    if function is None:
+        known = [*FUNCTIONS, *(one[:-1] for one in names if one.endswith("("))]
+        hint = nearest(piece.text, known) or f"; functions are {' '.join(known)}"
+        raise Problem(f"'{piece.text}' is not a function{hint}", piece.position)
+    wanted = len(function.arguments)
+    told = f"{name} takes {wanted} argument{'' if wanted == 1 else 's'}, {len(arguments)} given"
+    _refuse(len(arguments) != wanted, told, piece.position)
+    own = {key: argument(names) for key, argument in zip(function.arguments, arguments, strict=True)}
+    try:
+        return compiled(function.body.text).term(ChainMap(own, names))  # type: ignore[arg-type]
+    except Problem as problem:
+        raise Problem(f"in {name} of {function.body.where}: {problem.message}", piece.position) from None
+
+
+def definition_of(line: Line, start: int) -> DeckFunction:
+    """The function of a `.func` line, ``name(x, y) {x*y}``, whose body may stand without braces or behind a sign."""
+    match = _FUNCTION.fullmatch(line.text, start)
+    if match is None:
+        raise InputError("write .func name(x, y) {x*y}", line.where(start))
+    name, arguments = match[1].lower(), tuple(one.strip().lower() for one in match[2].split(","))
+    refuse(name in RESERVED, f"function '{match[1]}' is built in; allowed: another name", line.where(match.start(1)))
+    wrong = [one for one in arguments if not one.isidentifier() or arguments.count(one) > 1]
+    refuse(
+        wrong, f"an argument of {match[1]} is {', '.join(wrong[:1])!r}; allowed: names, each once", line.where(start)
+    )
+    begin, end = match.span(3)
+    if line.text[begin : begin + 1] + line.text[end - 1 : end] in ("{}", "''"):
+        begin, end = begin + 1, end - 1
+    return DeckFunction(name, arguments, Lexeme("expression", line.text[begin:end], begin, line))
+
+
+def in_scope(functions: Mapping[str, DeckFunction]) -> dict[str, DeckFunction]:
+    """Functions by their names in a scope, refused where one calls itself."""
+    calls = {name: [one for one in _expression(f.body).calls if one in functions] for name, f in functions.items()}
+    size: dict[str, tuple[int, int]] = {}  # Calls that one makes in all, and their depth
+    try:
+        for name in TopologicalSorter(calls).static_order():
+            below = [size[one] for one in calls[name]]
+            count, depth = size[name] = 1 + sum(n for n, _ in below), 1 + max((d for _, d in below), default=0)
+            most = f"a call of {name} makes {count:,}, {depth} deep; allowed: {MAX_CALLS:,}, {MAX_DEPTH} deep"
+            refuse(count > MAX_CALLS or depth > MAX_DEPTH, most, functions[name].body)
+    except CycleError as error:
+        path, place = " -> ".join(error.args[1][::-1]), functions[error.args[1][0]].body.where
+        raise InputError(f"functions refer to each other in a circle: {path}", place) from None
+    return {f"{name}(": one for name, one in functions.items()}
+
+
+def _expression(body: Lexeme) -> Expression:
+    try:
+        return compiled(body.text)
+    except Problem as problem:
+        raise InputError(problem.message, body.place(problem.position)) from None
+
+
 compiled = lru_cache(maxsize=8192)(Expression)  #: The expression of a text; raises `Problem` if it is not arithmetic.
 
 
@@ -294,6 +362,7 @@ _FILE_NAME = re.compile(r".*[/\\].*|.*\.[A-Za-z]\w*")
 _PLAIN_NUMBER = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?[A-Za-z]*")
 _OF_TIME = re.compile(r"(?<![A-Za-z])(?:t|time)(?![A-Za-z])", re.IGNORECASE)
 _OPERATOR = re.compile(r"[-+*/^]")
+_FUNCTION = re.compile(r"\s*([A-Za-z_]\w*)\s*\(([^()]*)\)\s*=?\s*(\S.*?)\s*")
 _PAIR = re.compile(r"[({]|[)}]|'[^']*'|(?<![\w.])([A-Za-z_]\w*)\s*=(?!=)|[<>!=]=|=")
 
 #: Kinds of text that are evaluated without braces: nothing, a parameter's name, or also arithmetic. As in ngspice,
@@ -349,9 +418,13 @@ class Scope:
     and at last in the deck; the place of the subcircuit's definition does not matter.
     """
 
-    def __init__(self, definitions: Iterable[Assignment], parent: Scope | None = None) -> None:
+    def __init__(
+        self, definitions: Iterable[Assignment], parent: Scope | None = None,
+        functions: Mapping[str, DeckFunction] = MappingProxyType({}),
+    ) -> None:  # fmt: skip
         self.values: dict[str, float] = {}
-        self._visible: ChainMap[str, float] = ChainMap(self.values, *(parent._visible.maps if parent else ()))
+        above: Any = parent._visible.maps if parent else (functions,)
+        self._visible: ChainMap[str, Any] = ChainMap(self.values, *above)
         self._mega: ChainMap[str, Token | None] = ChainMap({}, *(parent._mega.maps if parent else ()))  # As in `Number`
         self._definitions: dict[str, Assignment] = {}
         for definition in definitions:
@@ -370,7 +443,7 @@ class Scope:
         """The parameters' values; each definition, in any order, is evaluated after those of the parameters in it."""
         texts = {name: one.value for name, one in self._definitions.items() if name not in self.values}
         # What is no arithmetic has no names, and is refused when its turn comes.
-        graph = {name: _names_in(text.text) or () for name, text in texts.items()}
+        graph = {name: self._needs(text.text) for name, text in texts.items()}
         try:
             for name in filter(texts.__contains__, TopologicalSorter(graph).static_order()):
                 self.preset(name, self.number(texts[name]))
@@ -384,6 +457,17 @@ class Scope:
             problem = f"parameters refer to each other in a circle: {' -> '.join(shown)}"
             raise InputError(problem, self._definitions[path[0]].key.where) from None
         return self.values
+
+    def _needs(self, text: str) -> set[str]:
+        """The names in an expression and in the bodies of the functions that it calls."""
+        with suppress(Problem):
+            found = compiled(text)
+            called = (self._visible.get(f"{name}(") for name in found.calls)
+            bodies = (
+                self._needs(one.body.text) - set(one.arguments) for one in called if isinstance(one, DeckFunction)
+            )
+            return set(found.names).union(*bodies)
+        return set()
 
     def number(self, lexeme: Lexeme) -> Number:
         """Value of a lexeme that must be arithmetic, with or without braces."""
@@ -458,7 +542,7 @@ def definitions(line: Line, start: int) -> list[Assignment]:
         if match[1] is not None and depth == 0:
             keys.append((Lexeme("word", match[1], match.start(), line), match.end()))
         elif found == "=" and depth == 0:
-            problem = "the name before '=' is missing: write .param name=value (functions are not supported)"
+            problem = "the name before '=' is missing: write .param name=value, and functions as .func name(x) {2*x}"
             raise InputError(problem, line.where(match.start()))
     ends = [*(key.position for key, _ in keys), len(line.text)]
     before = line.text[start : ends[0]].strip(" \t,")

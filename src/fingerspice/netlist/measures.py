@@ -19,7 +19,7 @@ _VECTOR = r"@[\w.]+\[\w+\]|[A-Za-z_]\w*\((?:[^()]|\([^()]*\))*\)"
 _WORDS = re.compile(rf"\s*(?:(?P<sign>=)|(?P<braced>\{{[^{{}}]*\}}|'[^']*')|(?P<vector>{_VECTOR})|(?P<word>[^\s=]+))")
 _IN_BRACES = re.compile(_VECTOR)
 _ALIASES = {"integral": "integ", "derivative": "deriv", "average": "avg"}
-_FORMS = "AVG RMS MIN MAX PP INTEG MIN_AT MAX_AT FIND DERIV WHEN TRIG PARAM"
+FORMS = "AVG RMS MIN MAX PP INTEG MIN_AT MAX_AT FIND DERIV WHEN TRIG PARAM"
 # Words at which a vector or an expression of vectors has ended.
 _STOPS = ("=", "from", "to", "at", "when", "val", "td", "targ", *EDGES)
 _OTHERS = ("ac", "dc", "op", "noise", "tf", "sp")  # Analyses of which nothing is measured here
@@ -211,7 +211,7 @@ def read_measure(
         return Measure(name, "none", refused=f"a measure of {analysis.upper()} is not made here")
     kind = words.take("what is measured")[1].lower()
     kind = _ALIASES.get(kind, kind)
-    refuse(kind not in _FORMS.lower().split(), f".meas {name} {kind!r}; allowed: {_FORMS}", line.where(start))
+    refuse(kind not in FORMS.lower().split(), f".meas {name} {kind!r}; allowed: {FORMS}", line.where(start))
     of = start_at = stop_at = formula = None
     needs: tuple[str, ...] = ()
     if kind == "param":

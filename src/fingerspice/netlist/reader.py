@@ -10,7 +10,7 @@ import re
 import sys
 import tomllib
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from encodings import cp1252
@@ -23,7 +23,7 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import Tran
 from fingerspice.circuit.devices import called_devices
 from fingerspice.netlist import lexer
-from fingerspice.netlist.expressions import Call, Value, Word, definitions
+from fingerspice.netlist.expressions import Call, DeckFunction, Value, Word, definition_of, definitions
 from fingerspice.netlist.lexer import Assignment, Lexeme, Line, decimal_comma, group, lex, logical_lines, nearest
 from fingerspice.waveforms.files import file_fault
 from fingerspice.waveforms.waveform import refuse
@@ -189,8 +189,8 @@ MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
 _USED = (
-    ".tran", ".ac", ".meas", ".measure", ".four", ".options", ".ic", ".param", ".subckt", ".ends", ".include", ".inc",
-    ".lib", ".control", ".end",
+    ".tran", ".ac", ".meas", ".measure", ".four", ".options", ".ic", ".param", ".func", ".global", ".subckt", ".ends",
+    ".include", ".inc", ".lib", ".endl", ".control", ".end",
 )  # fmt: skip
 _UNUSED = (".print", ".plot", ".save", ".probe", ".title")
 #: Every directive that may stand in a deck; `Deck._direct` says what is done with it.
@@ -243,6 +243,9 @@ class Deck:
     params: dict[str, float] = field(default_factory=dict)  # The deck's own parameters by lower-case name
     # Names of `.meas` and `.four` lines, these, and where their arguments begin
     measures: list[tuple[str, Line, int]] = field(default_factory=list)
+
+    functions: dict[str, DeckFunction] = field(default_factory=dict)  # Those of `.func` by name in lower case
+    shared: dict[str, str] = field(default_factory=dict)  # Nodes of `.global`, as written, by name in lower case
 
     def __post_init__(self) -> None:
         self.root = Subcircuit("", Where(self.file, 1))
@@ -342,13 +345,23 @@ class Deck:
             case ".end":
                 refuse(self._reading, "only the netlist itself, not an included file, has .end", place)
                 self._ended = True
+            case ".endl":
+                raise InputError(".endl without its .lib: a section is read by .lib FILE SECTION", place)
             case ".endc":
                 raise InputError(".endc without a .control before it", place)
             case _ if name in _UNUSED:
                 self.unused[name] = None
             case _ if name in (".nodeset", ".backanno"):
                 pass  # These matter only to other simulators.
-            case _ if name != ".global" or not set(text.lower().split()) <= {"gnd", "0"}:
+            case ".global":
+                names = lex(line, rest)
+                refuse(not names or any(one.kind != "word" for one in names), "write .global node node ...", place)
+                self.shared |= {one.text.lower(): one.text for one in names}
+            case ".func":
+                function = definition_of(line, rest)
+                twice = self.functions.setdefault(function.name, function) is not function
+                refuse(twice, f"function '{function.name}' is defined twice", place)
+            case _:
                 hint = nearest(name, DIRECTIVES) or f"; directives are {' '.join(_USED)}"
                 hint = f": {ELSEWHERE[name]}" if name in ELSEWHERE else hint
                 raise InputError(f"{name} is not supported{hint}", place)
@@ -390,10 +403,11 @@ class Deck:
             refuse(not closed, f"{name[0]} is never closed", where)
             name, words = inner, [inner, *after.split()]
         refuse(not name.strip(), f"{directive} needs a file name", line.where())
-        problem = "one file name is allowed; put a name with blanks in quotes"
-        if directive == ".lib":
-            problem = "sections of a library are not supported: put the section into a file and .include it"
-        refuse(len(words) > 1, problem, where)
+        section = words.pop().lower() if directive == ".lib" and len(words) == 2 else ""
+        name = name if not section or name == words[0] else words[0]
+        refuse(len(words) > 1, "one file name is allowed; put a name with blanks in quotes", where)
+        begins = directive == ".lib" and self._reading and "." not in name
+        refuse(begins, f"'{name}' begins a section of a library; allowed: .lib FILE SECTION, which reads one", where)
         folder = self._reading[-1].parent if self._reading else self._folder
         base = name.replace("\\", "/").rpartition("/")[2]
         if base.lower() in LIBRARIES.values():
@@ -414,6 +428,25 @@ class Deck:
         refuse(self._size > MAX_BYTES, f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
         self._reading.append(path)
         shown = str(Path(self.file).parent / path.relative_to(self._folder))
-        for included in logical_lines(self.split(text, where), shown):
+        lines = logical_lines(self.split(text, where), shown)
+        for included in _section(lines, section, where) if section else lines:
             self._take(included)
         self._reading.pop()
+
+
+def _section(lines: Iterable[Line], name: str, where: Where) -> list[Line]:
+    """The lines of a library between ``.lib NAME`` and ``.endl``."""
+    found, here = dict[str, list[Line]](), ""
+    for line in lines:
+        words = line.text.lower().split()
+        if words[0] == ".lib" and len(words) == 2 and not here:
+            here = words[1]
+            found.setdefault(here, [])
+        elif words[0] == ".endl":
+            here = ""
+        elif here:
+            found[here].append(line)
+    hint = nearest(name, found) or f"; its sections are {', '.join(found) or 'none'}"
+    refuse(name not in found, f"the library has no section '{name}'{hint}", where)
+    refuse(here, f"section '{here}' of the library has no .endl", where)
+    return found[name]

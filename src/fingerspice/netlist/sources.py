@@ -12,9 +12,11 @@ from typing import Any, NamedTuple
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import SmallSignal
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.netlist.expressions import Call, Number, Token, Word, evaluated, number
+from fingerspice.circuit.laws import LAWS, PAPER
+from fingerspice.netlist.expressions import CONSTANTS, FUNCTIONS, Call, Number, Token, Word, evaluated, number
 from fingerspice.netlist.lexer import is_unit, nearest
-from fingerspice.netlist.reader import Context, Statement
+from fingerspice.netlist.measures import FORMS
+from fingerspice.netlist.reader import DIRECTIVES, Context, Statement
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.periodic import PWL, Burst, Pulse, Repeat, Sawtooth, Square, Triangle
 from fingerspice.waveforms.samples import Samples
@@ -196,13 +198,42 @@ def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
         raise error if error.where else InputError(f"{name}: {error.message}", call.where) from None
 
 
+def _listed(words: Mapping[str, inspect.Parameter]) -> list[str]:
+    return [key for key, p in words.items() if p.kind <= p.POSITIONAL_OR_KEYWORD]
+
+
+def _usage(name: str, listed: list[str]) -> str:
+    return f"{name}({' '.join(listed)})"
+
+
+def vocabulary() -> dict[str, list[str]]:
+    """All that a deck may say, by kind, from the registries that its reader asks."""
+    devices = []
+    for one in DEVICES.values():
+        pairs = [p.name if p.default is None else f"{p.name}={p.default:g}" for p in one.parameters]
+        given = " ".join(x if one.cells else "value" for x in pairs) if pairs else "[DC] value, AC ..., or a source"
+        letter = "X..." if one.cells else f"{one.name}..."
+        devices.append(f"{letter} {' '.join((*one.nodes, *([one.name] if one.cells else [])))} {given}  ({one.what})")
+    sources = {name: one for name, one in SOURCES.items() if not one.refused}
+    return {
+        "elements and devices": [*devices, "X... node ... NAME key=value ...  (a .subckt)"],
+        "sources": [one.usage if "(" in one.usage else _usage(name.upper(), _listed(_WORDS[one]) or ["t v ..."])
+                    for name, one in sources.items()],
+        "laws of contact": [f"law={name}" for name in (PAPER, *LAWS)],
+        "directives": list(DIRECTIVES),
+        "measures": FORMS.split(),
+        "functions": [f"{name}({','.join('xyz'[:count])})" for name, (_, count) in FUNCTIONS.items()],
+        "constants": list(CONSTANTS),
+    }  # fmt: skip
+
+
 def _made(function: Function, call: Call, context: Context) -> Waveform:
     """The waveform of a call, whose words become the arguments of a source function."""
     name, given, taken = call.text.upper(), len(call.args), _WORDS[function]
-    listed = [key for key, p in taken.items() if p.kind <= p.POSITIONAL_OR_KEYWORD]
+    listed = _listed(taken)
     named = [key for key, p in taken.items() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     needed = sum(taken[key].default is inspect.Parameter.empty and key not in _MISSING for key in listed)
-    usage = "allowed: " + (function.usage or f"{name}({' '.join(listed)})")
+    usage = f"allowed: {function.usage or _usage(name, listed)}"
     refuse(given < needed, f"{name} needs {needed} values, {given} given; {usage}", call)
     if given > len(listed) > 0:
         hint = "; Ncycles is not supported, a burst is BURST(amplitude frequency cycles), in Python fs.Burst"
