@@ -317,3 +317,12 @@ def test_circuits_with_measures_travel_and_files_keep_harmonics_and_currents(tmp
     for name, values in raws[0].vectors.items():
         np.testing.assert_array_equal(raws[1].vectors[name], values)
     assert "* The deck's .meas and .four lines are left out." in fs.export_netlist(circuit)
+
+
+def test_measures_take_the_functions_of_the_deck() -> None:
+    lines = ".func db(x) {20*log10(x)*k}", ".param k=2", "V1 a 0 SIN(0 10 100)", "R1 a b 1k", "C1 b 0 1u"
+    asked = ".meas tran top MAX V(b)", ".meas tran level PARAM='db(top)'", ".meas tran more MAX {db(abs(V(b))+1)}"
+    run = fs.simulate(deck(*lines, *asked, ".tran 10u 20m"))
+    top, level, more = (run.measures[name] for name in ("top", "level", "more"))
+    assert level == pytest.approx(40.0 * np.log10(top), rel=1e-12)
+    assert more == pytest.approx(40.0 * np.log10(top + 1.0), rel=1e-9)

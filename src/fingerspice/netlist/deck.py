@@ -50,8 +50,8 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
         deck.warn(problem, Where(deck.file, 1))
     try:
         deck.read_lines(lines)
-        scope = Scope(deck.root.params, functions=in_scope(deck.functions))
-        deck.params = scope.solve()
+        scope = Scope(deck.root.params, functions=(functions := in_scope(deck.functions)))
+        deck.params = {**scope.solve(), **functions}
         _Instance(deck, deck.root, scope).expand()
     except InputError as error:
         raise with_comma(error, deck.warnings) from None

@@ -17,7 +17,7 @@ from encodings import cp1252
 from functools import cache
 from itertools import islice
 from pathlib import Path, PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import Tran
@@ -240,7 +240,7 @@ class Deck:
     files: list[Path] = field(default_factory=list)  # The other included files, which were read
     unused: dict[str, None] = field(default_factory=dict)  # Ordered set of the directives without effect here
     warnings: list[str] = field(default_factory=list)  # About what is probably not meant, each with its place
-    params: dict[str, float] = field(default_factory=dict)  # The deck's own parameters by lower-case name
+    params: dict[str, Any] = field(default_factory=dict)  # The deck's own parameters and functions, as a scope has them
     # Names of `.meas` and `.four` lines, these, and where their arguments begin
     measures: list[tuple[str, Line, int]] = field(default_factory=list)
 
