@@ -19,9 +19,10 @@ def test_every_number_of_a_row_is_within_its_bounds(n: int, row: Any) -> None:
     assert row.kind in evidence.VERDICTS
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 6, 7, 9, 15, 18])
+@pytest.mark.parametrize("n", [1, 2, 5, 6, 7, 9, 15, 18, 23])
 def test_another_finger_is_outside_the_bounds(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    other = {"Xgap.r": 3e6, "Xgap.d": 2e-6, "Xgap.c2": 2000.0}
+    # With more voltage, or across a thinner gap, row 23's gap would close, which is no number.
+    other = {"Xgap.c2": 2000.0} | ({} if n == 23 else {"Xgap.r": 3e6, "Xgap.d": 2e-6})
     monkeypatch.setattr(evidence, "FINGER", evidence.FINGER.replace(other))
     row = evidence.ROWS[n - 1]
     assert any(not low <= number <= high for number, (low, high) in zip(row.make(), row.bounds, strict=True))

@@ -131,6 +131,11 @@ class Network(Remembering):
         """Indices of the ridge areas that a GAP drives."""
         return tuple(i for i, gap in enumerate(self.gaps) if gap is not None and not self.areas[i].own)
 
+    @cached_property
+    def finger_cells(self) -> tuple[int, ...]:
+        """Index of the cell of each finger's GAP."""
+        return tuple(cell for i in self.fingers if (cell := self.gaps[i]) is not None)
+
     @property
     def owned(self) -> bool:
         """Whether a GAP's own capacitance or leak follows its voltage otherwise than its ridge area does."""

@@ -353,8 +353,7 @@ class Record(Signals):
 
     @cached_property
     def u_gap(self) -> FloatArray | None:
-        cells = (self.network.gaps[i] for i in self.network.fingers)
-        return side_by_side([self.cell_voltage(cell) for cell in cells if cell is not None])
+        return side_by_side([self.cell_voltage(cell) for cell in self.network.finger_cells])
 
     @cached_property
     def area(self) -> FloatArray | None:

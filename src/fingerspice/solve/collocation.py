@@ -248,7 +248,7 @@ def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list
     modes = scene.modes_at(area) if area is not scene.net.area0 else scene.modes
     n, n_s = modes.gains.shape
     slow, fed, fingers = net.slow >= 0, _fed(scene), list(network.fingers)
-    n_slow, cells = int(np.count_nonzero(slow)), np.array([network.gaps[i] for i in fingers], int)
+    n_slow, cells = int(np.count_nonzero(slow)), np.array(network.finger_cells, int)
     parts = by_modes(network, modes, area)
     tap, tap_s = parts["tap"], parts["tap_s"]
     gap, gap_s = np.zeros((area.size, n)), np.zeros((area.size, n_s))

@@ -215,8 +215,7 @@ class Search(Period):
         self.decay = self.turned * np.exp(-self.rates * self.span)
         self._solve_by(np.diag(1.0 / np.where(self.free, 1.0 - self.decay, math.inf)))
         self.z = self._holding(self.z)
-        cells = [problem.network.gaps[i] for i in self.fingers]
-        gap = problem.network.p[np.array(cells, int)] @ self.modes.shape
+        gap = problem.network.p[np.array(problem.network.finger_cells, int)] @ self.modes.shape
         # Derivative of every gap's voltage by z; its columns for areas with a time constant are 0.
         self.gap = np.hstack([gap, np.zeros((gap.shape[0], self.rates.size - self.n))])
 

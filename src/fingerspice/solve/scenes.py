@@ -112,8 +112,7 @@ class Scene(Remembering):
     @cached_property
     def measured(self) -> tuple[int, ...]:
         """Cells for whose voltages errors are stated: the gaps, or without gaps the cell of smallest capacitance."""
-        gaps = tuple(cell for cell in map(self.network.gaps.__getitem__, self.network.fingers) if cell is not None)
-        if gaps or not self.network.cells:
+        if (gaps := self.network.finger_cells) or not self.network.cells:
             return gaps
         return (int(np.argmin(self.network.capacitance(self.net.area0))),)
 
