@@ -52,6 +52,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.steady import large_signal as large_signal
     from fingerspice.studies.steady import phasor as phasor
     from fingerspice.studies.steady import steady_state as steady_state
+    from fingerspice.studies.steps import operating_points as operating_points
+    from fingerspice.studies.steps import run_steps as run_steps
     from fingerspice.studies.sweep.populations import sobol as sobol
     from fingerspice.studies.sweep.populations import sweep as sweep
     from fingerspice.waveforms.periodic import PWL as PWL

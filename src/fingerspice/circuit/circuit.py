@@ -122,6 +122,18 @@ class AcSweep:
 
 
 @dataclass(frozen=True)
+class Step:
+    """What a `.step` or `.dc` line changes, and its values in the netlist's unit.
+
+    `name` is that of a `.param`, in lower case, or a path as in `Circuit.replace`; of a source it steps the level.
+    """
+
+    name: str
+    values: tuple[float, ...]
+    of_param: bool = False
+
+
+@dataclass(frozen=True)
 class Parameter:
     """Value and unit of one circuit parameter."""
 
@@ -160,6 +172,10 @@ class Circuit(Remembering, Shown):
         Of its `.meas` lines.
     fourier : tuple of tuple of float and Quantity
         Of its `.four` lines: fundamental, Hz, and vector.
+    steps, dc : tuple of Step
+        Of its `.step` lines, and of its `.dc` line, the innermost first.
+    op : bool
+        Whether it asks for the operating point.
     related : Remembering
         Cache of results that depend on nodes and devices alone, shared by all circuits that `replace` derives.
     """
@@ -179,6 +195,9 @@ class Circuit(Remembering, Shown):
     sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     measures: tuple[Measure, ...] = ()
     fourier: tuple[tuple[float, Quantity], ...] = ()
+    steps: tuple[Step, ...] = ()
+    dc: tuple[Step, ...] = ()
+    op: bool = False
     related: Remembering = field(default_factory=Remembering, init=False, repr=False, compare=False)
 
     def _page(self) -> Page:

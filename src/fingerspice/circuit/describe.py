@@ -286,7 +286,8 @@ def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
 
 def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
     """Warnings about directives without effect, but for those of ngspice's options."""
-    return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(".options"))
+    stepped = [".step has no effect in one run: fingerspice run and fs.run_steps take it"] if circuit.steps else []
+    return (*(f"{name} has no effect here" for name in circuit.unused if not name.startswith(".options")), *stepped)
 
 
 def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) -> Iterator[str]:

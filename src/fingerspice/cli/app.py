@@ -97,6 +97,10 @@ def run(
     if schematic:  # Only then: it loads matplotlib, which takes as long as a run.
         from fingerspice.plots.schematic import put_beside
     circuit, start = with_times(job.read(), job.stop, start)
+    ends = studies.ends_beside(circuit)
+    if circuit.tran is None and (circuit.op or ends):
+        studies.without_run(job, circuit, ends)
+        return
     if circuit.tran is None:
         raise InputError(f"{job.deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
     how: dict[str, Any] = {"start": start, "rtol": job.rtol, "method": method}
@@ -107,14 +111,20 @@ def run(
         from fingerspice.cli.store import run_streamed
 
         refuse(not stream, "--chunk, --signals and --netcdf go with --stream")
-        for option in [key for key, on in (("csv", csv), ("raw", raw), ("feel", feel), ("schematic", schematic)) if on]:
-            raise InputError(f"--{option} does not go with --stream, which writes Zarr; allowed: --netcdf beside it")
+        _alone("does not go with --stream, which writes Zarr; allowed: --netcdf beside it",
+               csv=csv, raw=raw, feel=feel, schematic=schematic)  # fmt: skip
         run_streamed(job, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
+        return
+    if circuit.steps:
+        _alone("goes with one run, and the deck has .step; allowed: its values by --set",
+               raw=raw, feel=feel, schematic=schematic)  # fmt: skip
+        studies.stepped(job, circuit, how, csv, ends)
         return
     fingers: list[fs.Feel] = []
     refuse(feel and not circuit.by_device("GAP"), "--feel: the circuit has no GAP, so there is no friction to feel")
     more = [end for end, on in (("_schematic.svg", schematic), ("_feel.png", feel), (".raw", raw)) if on]
-    job.check_files(circuit, ".csv" if csv else ".nc", ".png", *more)
+    job.check_files(circuit, ".csv" if csv else ".nc", ".png", *more, *ends)
+    said, others = studies.beside_run(job, circuit) if circuit.op or ends else ([], {})
     with paced("simulating") as update:
         solution = simulate(circuit, **how, jumps=jumps, throw=False, progress=update)
     if job.json:
@@ -132,15 +142,21 @@ def run(
         ".png": lambda: put_beside(solution.plot(), circuit) if schematic else solution.plot(),
         # An SVG file knows no names of our own, and keeps all of them as one text.
         "_schematic.svg": lambda file: circuit.draw().write(file, {"Description": json.dumps(job.about)}),
-        "_feel.png": lambda: fingers[0].plot(fingers[1:]) if fingers else None,
+        "_feel.png": lambda: fingers[0].plot(fingers[1:]) if fingers else None, **others,
     }  # fmt: skip
     if not solution.t.size:
         job.files.clear()
-    job.give(lambda: "\n\n".join([solution._page(), *map(str, fingers)]), makes)
+    job.give(lambda: "\n\n".join([solution._page(), *map(str, fingers), *said]), makes)
     if solution.failure is not None:
         raise fs.SolveError(solution.failure, solution)
     if unfelt is not None:
         raise unfelt
+
+
+def _alone(why: str, **options: bool) -> None:
+    """Refuse these options if they are given."""
+    for option in [key for key, on in options.items() if on]:
+        raise InputError(f"--{option} {why}")
 
 
 def ac(

@@ -125,7 +125,8 @@ class Job:
                 if str(warning.message) in map(printable, given):
                     warnings.warn(str(warning.message), FingerspiceWarning, stacklevel=2)
         # `simulate` gives these warnings itself, but commands that do not call it with this circuit would not.
-        for text in directive_warnings(circuit):
+        steps = self.answer["command"] in ("run", "export")
+        for text in directive_warnings(dataclasses.replace(circuit, steps=()) if steps else circuit):
             warnings.warn(text, FingerspiceWarning, stacklevel=2)
         others = [name.removeprefix(".options ") for name in circuit.unused if name.startswith(".options ")]
         if others:

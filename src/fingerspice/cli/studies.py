@@ -1,10 +1,11 @@
-"""The commands for studies: `design`, `limits`, `fit`, `fit-contact` and `sweep`."""
+"""The commands for studies: `design`, `limits`, `fit`, `fit-contact` and `sweep`; and what a deck asks of `run`."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,9 +15,11 @@ from typer import Argument
 import fingerspice as fs
 from fingerspice.base.announcing import paced
 from fingerspice.base.errors import InputError
-from fingerspice.base.files import write_aside
+from fingerspice.base.files import write_aside, write_csv
 from fingerspice.base.pages import Table
 from fingerspice.cli.options import Job, Makes, number
+from fingerspice.cli.terminal import complain
+from fingerspice.results.record import amount_text
 from fingerspice.waveforms.waveform import refuse, require
 
 #: Keys of a sweep's file, and the arguments of `batch` among them.
@@ -40,6 +43,85 @@ def _report(job: Job, circuit: fs.Circuit, files: Mapping[str, str], make: Calla
     found = make()
     job.answer.update({key: found.to_dict()} if key else found.to_dict())
     job.give(lambda: str(found), {end: getattr(found, method) for end, method in files.items()})
+
+
+def stepped(job: Job, circuit: fs.Circuit, how: Mapping[str, Any], csv: bool, ends: Iterable[str]) -> None:
+    """The part of `run` for a deck with `.step`: a table, a data file, and a family of curves."""
+    from fingerspice.plots.picture import plot_steps
+    from fingerspice.studies.steps import table_of
+
+    job.check_files(circuit, ".csv" if csv else ".nc", ".png", *ends)
+    said, others = beside_run(job, circuit)
+    with paced("simulating the steps") as update:
+        found = fs.run_steps(circuit, progress=update, **how)
+    rows, columns = table_of(found)
+    job.answer.update(steps=rows)
+    for text in found.attrs["failures"]:
+        complain(f"warning: {text}")
+    # An empty list cannot be kept in a file.
+    known = {key: value for key, value in found.attrs.items() if value != []}
+    kept = found.drop_attrs(deep=False).assign_attrs({**known, "deck": circuit.text, **job.about})
+    makes: Makes = {
+        ".csv": lambda file: write_csv(file, list(columns), zip(*columns.values(), strict=True)),
+        ".nc": lambda file: write_aside(file, lambda aside: kept.to_netcdf(aside, engine="h5netcdf")),
+        ".png": partial(plot_steps, found), **others,
+    }  # fmt: skip
+    job.give(lambda: "\n\n".join([circuit.title, _first_rows(columns), *said]), makes)
+
+
+_FIRST = 40  # Most rows of a table of steps that are printed
+
+
+def _first_rows(columns: Mapping[str, Any]) -> str:
+    """The first rows of columns of numbers and words, as a table."""
+    rows = [
+        *zip(*([x if isinstance(x, str) else f"{x:.6g}" for x in column] for column in columns.values()), strict=True)
+    ]
+    more = [f"... {len(rows) - _FIRST:,} more rows"] if len(rows) > _FIRST else []
+    return "\n".join([Table(tuple(columns), rows[:_FIRST], left=0).text(), *more])
+
+
+def ends_beside(circuit: fs.Circuit) -> list[str]:
+    """Endings of the files of what a deck asks for beside its run."""
+    return [f"_{kind}.{end}" for kind, on in (("dc", circuit.dc), ("ac", circuit.ac)) if on for end in ("csv", "png")]
+
+
+def without_run(job: Job, circuit: fs.Circuit, ends: Iterable[str]) -> None:
+    """The part of `run` for a deck without `.tran`, which asks for other things."""
+    job.check_files(circuit, *ends)
+    said, makes = beside_run(job, circuit)
+    job.give(lambda: "\n\n".join([circuit.title, *said]), makes)
+
+
+def beside_run(job: Job, circuit: fs.Circuit) -> tuple[list[str], Makes]:
+    """What a deck asks of `run` by `.op`, `.dc` and `.ac`: texts, and what writes its files by their endings."""
+    from fingerspice.results.spectrum import phasor_csv
+    from fingerspice.studies.steady import sweep_frequencies
+    from fingerspice.studies.steps import table_of
+
+    texts, makes = list[str](), dict[str, Any]()
+    if circuit.op:
+        found = fs.operating_points(dataclasses.replace(circuit, dc=()), charge_law=job.charge_law)
+        point = {str(name): float(one) for name, one in found.data_vars.items() if name != "status"}
+        job.answer.update(op=point)
+        cells = [(name, amount_text(x, found[name].attrs["units"])) for name, x in point.items()]
+        texts.append(Table(("operating point", ""), cells).text())
+    if circuit.dc:
+        from fingerspice.plots.picture import plot_steps
+
+        swept = fs.operating_points(circuit, charge_law=job.charge_law)
+        rows, columns = table_of(swept)
+        job.answer.update(dc=rows)
+        makes["_dc.csv"] = lambda file: write_csv(file, list(columns), zip(*columns.values(), strict=True))
+        makes["_dc.png"] = partial(plot_steps, swept)
+    if circuit.ac is not None:
+        from fingerspice.plots.traces import plot_phasor
+
+        sweeps = (fs.phasor(circuit, sweep_frequencies(circuit.ac)),)
+        job.answer.update(sweeps=[one.to_dict() for one in sweeps] if job.json else None)
+        makes |= {"_ac.csv": partial(phasor_csv, sweeps), "_ac.png": partial(plot_phasor, sweeps, circuit)}
+        texts.append(str(sweeps[0]._page(12)))
+    return texts, makes
 
 
 def design(

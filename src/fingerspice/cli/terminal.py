@@ -24,7 +24,8 @@ COMMON = (
 OWN = {
     command: tuple(keys.split())
     for command, keys in {
-        "run": "area tier t_stop figures_from error fundamental fold_margin_min signals measures fourier feel stream",
+        "run": "area tier t_stop figures_from error fundamental fold_margin_min signals measures fourier feel stream "
+        "steps op dc sweeps",
         "ac": "area skin sweeps",
         "plan": "area tier reasons start rates stiff sensitivity error_bound plan_area",
         "compare": "frequency gaps phasor transient_mean_area transient_coupled vectors times",

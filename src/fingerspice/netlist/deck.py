@@ -8,10 +8,11 @@ A statement has a name, nodes and values; `netlist` and `sources` give it a mean
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import dropwhile
 from pathlib import Path
+from types import MappingProxyType
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, called_devices
@@ -34,10 +35,11 @@ _STATEMENT = re.compile(  #: Titles that are probably the netlist's first statem
 )
 
 
-def parse_deck(text: str, path: Path | None = None) -> Deck:
+def parse_deck(text: str, path: Path | None = None, values: Mapping[str, float] = MappingProxyType({})) -> Deck:
     """Read a netlist, whose first line is the title.
 
     Files are included from the folder of `path`, that of the file with this text; without it, only native libraries.
+    The deck's own parameters in `values` have these instead of their own.
     """
     deck = Deck(text, path)
     refuse(not text.strip("\ufeff \t\r\n"), f"'{deck.file}' is empty: a netlist begins with a title line")
@@ -51,6 +53,8 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
     try:
         deck.read_lines(lines)
         scope = Scope(deck.root.params, functions=(functions := in_scope(deck.functions)))
+        for name, value in values.items():
+            scope.preset(name, Number(value, f"{value:g}", deck.root.where))
         deck.params = {**scope.solve(), **functions}
         _Instance(deck, deck.root, scope).expand()
     except InputError as error:

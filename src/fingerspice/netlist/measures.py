@@ -1,4 +1,4 @@
-"""The grammar of `.meas` and `.four` lines."""
+"""The grammar of `.meas`, `.four`, `.step` and `.dc` lines."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number
-from fingerspice.circuit.circuit import Element
+from fingerspice.circuit.circuit import Element, Step
 from fingerspice.circuit.measures import EDGES, LAST, OF_DEVICES, Crossing, Measure, Quantity, Vector
 from fingerspice.netlist.expressions import CONSTANTS, FUNCTIONS, Problem, compiled, evaluated
 from fingerspice.netlist.lexer import Line, nearest
@@ -61,6 +61,12 @@ class _Line:
         kind, text, _ = self.words[self.at]
         self.at += 1
         return kind, text
+
+    def word(self, *allowed: str) -> str:
+        """The next word if it is one of these, which is passed; empty otherwise."""
+        found = self.peek() if self.peek() in allowed else ""
+        self.at += bool(found)
+        return found
 
     def equals(self) -> None:
         """Pass a sign =, if it is the next."""
@@ -259,3 +265,94 @@ def read_fourier(
     while words.at < len(words.words):
         found.append((frequency, words.quantity()))
     return found
+
+
+_MOST_STEPS = 100_000  # Values of all steps together
+
+
+def read_step(line: Line, start: int, params: Mapping[str, float], elements: Sequence[Element]) -> Step:
+    """A `.step` line: ``[param] NAME first last increment``, ``NAME list value ...``, or ``dec|oct NAME f l points``.
+
+    Raises
+    ------
+    InputError
+        For a name that is no parameter, no path and no source, and for no values or too many.
+    """
+    words = _Line(line, start, params, elements, ".step")
+    scale = words.word("dec", "oct", "lin")
+    words.word("param")
+    stepped = _stepped(words)
+    if words.word("list"):
+        values = []
+        while words.at < len(words.words):
+            values.append(words.number("a value"))
+        refuse(not values, ".step has a list without values; allowed: list 1 2 5", words)
+    else:
+        values = _spaced(words, scale)
+    if words.at < len(words.words):
+        raise InputError(f".step: {words.peek()!r} is not understood here", words.where)
+    return Step(stepped.name, tuple(values), stepped.of_param)
+
+
+def read_dc(line: Line, start: int, params: Mapping[str, float], elements: Sequence[Element]) -> tuple[Step, ...]:
+    """A `.dc` line: ``NAME first last increment``, twice for two that are swept, the first one fastest.
+
+    Raises
+    ------
+    InputError
+        As `read_step`.
+    """
+    words, found = _Line(line, start, params, elements, ".dc"), list[Step]()
+    while words.at < len(words.words) or not found:
+        one = _stepped(words)
+        found.append(Step(one.name, tuple(_spaced(words)), one.of_param))
+    return tuple(found)
+
+
+def _stepped(words: _Line) -> Step:
+    """The next word as what is stepped, without its values."""
+    place, written = words.where, words.take("what is stepped")[1]
+    key = written.lower()
+    refuse(key == "temp", f"{words.name} temp: nothing depends on temperature here; allowed: a .param, or R1", place)
+    if key in words.params and not key.endswith("("):
+        return Step(key, (), True)
+    known = {f"{e.name}.{name}".lower(): f"{e.name}.{name}" for e in words.elements for name in e.parameters}
+    known |= {e.name.lower(): e.name if e.device in "VI" else f"{e.name}.value" for e in words.elements
+              if len(e.device) == 1}  # fmt: skip
+    hint = nearest(key, [*known, *(one for one in words.params if not one.endswith("("))])
+    allowed = "a .param, a source, or a path such as Xgap.d"
+    refuse(key not in known, f"{words.name} {written!r} is not there{hint}; allowed: {allowed}", place)
+    return Step(known[key], ())
+
+
+def _spaced(words: _Line, scale: str = "") -> list[float]:
+    """Values from the next three numbers: first, last, and the increment or the points of a decade or octave."""
+    place = words.where
+    first, last, step = (words.number(what) for what in ("the first value", "the last value", "the increment"))
+    if scale in ("dec", "oct"):
+        base = 10.0 if scale == "dec" else 2.0
+        good = first > 0.0 and last > 0.0 and step >= 1.0
+        refuse(not good, f"{words.name} {scale} from {first:g} to {last:g} with {step:g} points; "
+               "allowed: values above 0, and 1 or more points", place)  # fmt: skip
+        count = abs(math.log(last / first, base)) * step
+    else:
+        refuse(step == 0.0 or (last - first) * step < 0.0, f"{words.name} from {first:g} to {last:g} by {step:g} "
+               "has no values; allowed: an increment that leads from the first to the last", place)  # fmt: skip
+        count = (last - first) / step
+    refuse(count >= _MOST_STEPS, f"{words.name} has {count:.3g} values; allowed: {_MOST_STEPS:,}", place)
+    number = range(math.floor(count * (1.0 + 1e-9) + 1e-9) + 1)
+    if scale in ("dec", "oct"):
+        values = [first * base ** math.copysign(k / step, last - first) for k in number]
+    else:
+        values = [first + k * step for k in number]
+    return [float(f"{x:.14g}") for x in values]
+
+
+def checked_steps(steps: Sequence[Step], name: str) -> tuple[Step, ...]:
+    """Several steps, nested, the first one innermost; refused are more than three, and too many values in all."""
+    count = math.prod(len(one.values) for one in steps)
+    refuse(len(steps) > 3, f"{len(steps)} {name} lines; allowed: three, nested")
+    refuse(count > _MOST_STEPS, f"{name} has {count:,} values in all; allowed: {_MOST_STEPS:,}")
+    twice = [one.name for k, one in enumerate(steps) if one.name in [other.name for other in steps[:k]]]
+    refuse(twice, f"{name} steps {', '.join(twice)} twice; allowed: once")
+    return tuple(steps)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -13,15 +13,15 @@ from typing import Any
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.units import exponent_and_scale, format_si
-from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element, Tran
-from fingerspice.circuit.devices import DEVICES, REST_AREA, ParameterSpec, mega_note, unit_trap, unusual
+from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element, Step, Tran
+from fingerspice.circuit.devices import DEVICES, REST_AREA, ParameterSpec, check, mega_note, unit_trap, unusual
 from fingerspice.circuit.laws import ContactLaw, law_of
 from fingerspice.circuit.measures import Measure, Quantity
 from fingerspice.circuit.network import checked
 from fingerspice.netlist.deck import parse_deck, with_comma
 from fingerspice.netlist.expressions import Call, Number, Token, Value, number
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
-from fingerspice.netlist.measures import read_fourier, read_measure
+from fingerspice.netlist.measures import checked_steps, read_dc, read_fourier, read_measure, read_step
 from fingerspice.netlist.reader import MAX_WARNINGS, OTHERS, Context, Deck, Statement, text_of
 from fingerspice.netlist.sources import read_source
 from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
@@ -96,16 +96,54 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
         notes[MAX_WARNINGS:] = [f"{more} more warnings are not shown"]
     laws = {"mobile" if "mobile" in name.lower() else "local" for name in deck.libraries}
     ac, measures = next(map(read_ac, deck.directives[".ac"]), None), list[Measure]()
-    fourier = list[tuple[float, Quantity]]()
-    for name, line, start in deck.measures:
-        if name == ".four":
-            fourier += read_fourier(line, start, deck.params, elements)
-        else:
-            measures.append(read_measure(line, start, deck.params, elements, measures))
+    fourier, steps, dc = list[tuple[float, Quantity]](), list[Step](), tuple[Step, ...]()
+    for name, line, start in deck.asked:
+        match name:
+            case ".four":
+                fourier += read_fourier(line, start, deck.params, elements)
+            case ".step":
+                steps.append(read_step(line, start, deck.params, elements))
+            case ".dc":
+                dc = read_dc(line, start, deck.params, elements)
+            case ".meas" | ".measure":
+                measures.append(read_measure(line, start, deck.params, elements, measures))
     refuse(len(laws) > 1, "both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
     law, said, effectless = next(iter(laws), None), tuple(notes), (*deck.unused, *unused, *unused_starts)
     read = deck.title, elements, tran, ac, initial, law, work, said, effectless, deck.text, deck.path
-    return checked(Circuit(*read, measures=tuple(measures), fourier=tuple(fourier)))
+    stepped: dict[str, Any] = {"steps": checked_steps(steps, ".step"), "dc": checked_steps(dc, ".dc")}
+    stepped["op"] = any(name == ".op" for name, _, _ in deck.asked)
+    return checked(Circuit(*read, measures=tuple(measures), fourier=tuple(fourier), **stepped))
+
+
+def at_parameters(circuit: Circuit, values: Mapping[str, float]) -> Circuit:
+    """The circuit with other values of its deck's `.param` lines; what `replace` has changed stays changed.
+
+    Raises
+    ------
+    InputError
+        If the deck cannot be read with these values, or has other elements then.
+    """
+
+    def read(given: Mapping[str, float]) -> Circuit:
+        return _read(parse_deck(circuit.text, circuit.path, given), [])
+
+    old, new = circuit.related.remember(("deck as it is",), lambda: read({})), read(values)
+    said = ", ".join(f"{name} = {value:g}" for name, value in values.items())
+    alike = [e.name for e in old.elements] == [e.name for e in new.elements]
+    refuse(not alike, f"with {said} the deck has other elements; allowed: values with which they stay")
+    elements = []
+    for was, own, now in zip(old.elements, circuit.elements, new.elements, strict=True):
+        mine = {key: value for key, value in own.values.items() if was.values.get(key) != value}
+        kept: dict[str, Any] = {"values": MappingProxyType({**now.values, **mine})}
+        kept |= {
+            name: getattr(own, name) for name in ("waveform", "ac", "law") if getattr(own, name) != getattr(was, name)
+        }
+        elements.append(own if was == now else replace(now, **kept))
+    same = {name: getattr(new, name) for name in ("tran", "initial", "measures", "fourier")
+            if getattr(circuit, name) == getattr(old, name)}  # fmt: skip
+    changed = circuit._with(elements=tuple(elements), **same)
+    check(changed)
+    return changed
 
 
 def _unusual(deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: dict[str, float]) -> Iterator[str]:

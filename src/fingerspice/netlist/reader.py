@@ -189,8 +189,8 @@ MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
 _USED = (
-    ".tran", ".ac", ".meas", ".measure", ".four", ".options", ".ic", ".param", ".func", ".global", ".subckt", ".ends",
-    ".include", ".inc", ".lib", ".endl", ".control", ".end",
+    ".tran", ".ac", ".op", ".dc", ".step", ".meas", ".measure", ".four", ".options", ".ic", ".param", ".func",
+    ".global", ".subckt", ".ends", ".include", ".inc", ".lib", ".endl", ".control", ".end",
 )  # fmt: skip
 _UNUSED = (".print", ".plot", ".save", ".probe", ".title")
 #: Every directive that may stand in a deck; `Deck._direct` says what is done with it.
@@ -241,9 +241,8 @@ class Deck:
     unused: dict[str, None] = field(default_factory=dict)  # Ordered set of the directives without effect here
     warnings: list[str] = field(default_factory=list)  # About what is probably not meant, each with its place
     params: dict[str, Any] = field(default_factory=dict)  # The deck's own parameters and functions, as a scope has them
-    # Names of `.meas` and `.four` lines, these, and where their arguments begin
-    measures: list[tuple[str, Line, int]] = field(default_factory=list)
-
+    # Names of the lines that ask for something of the whole deck, these, and where their arguments begin
+    asked: list[tuple[str, Line, int]] = field(default_factory=list)
     functions: dict[str, DeckFunction] = field(default_factory=dict)  # Those of `.func` by name in lower case
     shared: dict[str, str] = field(default_factory=dict)  # Nodes of `.global`, as written, by name in lower case
 
@@ -324,9 +323,9 @@ class Deck:
                     for other, first, _ in here.directives:
                         refuse(other == name, f"{name} is given twice, first at {first.where()}", place)
                 here.directives.append((".options" if name == ".option" else name, line, rest))
-            case ".meas" | ".measure" | ".four":
+            case ".meas" | ".measure" | ".four" | ".step" | ".dc" | ".op":
                 refuse(here is not self.root, f"{name} does not belong inside .subckt {here.name}", place)
-                self.measures.append((name, line, rest))
+                self.asked.append((name, line, rest))
             case ".param":
                 here.params += definitions(line, rest)
                 here.characters += len(line.text)

@@ -8,15 +8,19 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import EngFormatter, LogFormatter
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import in_notebook
 from fingerspice.plots import drawing
+from fingerspice.results.record import signal_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -196,6 +200,58 @@ def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> No
     drawing.dress(ax, "share of variance", ylim=(0.0, max(1.05, float(np.max(high)))))
     if x is not None:
         drawing.legend_within(ax, 44)
+
+
+_MOST_LINES, _MOST_PANELS = 60, 4  # Of a picture of steps
+
+
+def plot_steps(found: Dataset) -> Picture:
+    """Signals of `run_steps` over time, or of `operating_points` over what is swept first, coloured by a step.
+
+    A second step makes dashes, as far as there are dashes.
+    """
+    over_time = "time" in found.dims
+    names = [str(name) for name, one in found.data_vars.items() if not over_time or "time" in one.dims]
+    wanted = ("u_gap", "f_el", "f_t", "area") if any(name.startswith("u_gap") for name in names) else ("v",)
+    names = [name for key in wanted for name in names if name.partition(":")[0] == key][:_MOST_PANELS]
+    x, *steps = [*(["time"] if over_time else []), *(str(dim) for dim in found.dims if dim != "time")]
+    figure, axes = drawing.new_figure(len(names), height=1.0 + 1.4 * len(names), sharex=True)
+    colour, *dashed = steps or [""]
+    scale = found[colour].values if colour else np.zeros(1)
+    logarithmic = scale.min() > 0.0 and scale.max() > _WIDE * scale.min()
+    norm = (LogNorm if logarithmic else Normalize)(scale.min(), scale.max())
+    # Without its brightest yellow, which is pale on white.
+    palette = ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.92, 256)))
+    wave = found.stack(line=steps) if steps else found.expand_dims("line")
+    lines = np.unique(np.linspace(0, wave.line.size - 1, _MOST_LINES).astype(int))
+    at = found[x].values
+    factor_x, unit_x = drawing.engineering(
+        drawing.peak_of(at), found[x].attrs.get("units", ""), 2.0 if over_time else 1.0
+    )
+    for ax, name in zip(axes, names, strict=True):
+        values = wave[name].transpose("line", x).values
+        signal = signal_of(name)
+        factor, unit = drawing.engineering(drawing.peak_of(np.nan_to_num(values)), signal.unit, signal.least)
+        for k in lines:
+            place = wave[colour].values[k] if colour else 0.0
+            dash = int(np.searchsorted(found[dashed[0]].values, wave[dashed[0]].values[k])) if dashed else 0
+            style = drawing.DASHES[dash % len(drawing.DASHES)]
+            ax.plot(factor_x * at, factor * values[k], color=palette(norm(place)), linewidth=1.0, linestyle=style)
+        gap = f" {name.partition(':')[2]}" if ":" in name else ""
+        drawing.dress(ax, f"{signal.axis}{gap} [{unit}]")
+    drawing.dress(axes[-1], xlabel=f"{'Time' if over_time else x} [{unit_x}]" if unit_x else x)
+    if colour:
+        unit = found[colour].attrs.get("units", "")
+        shown = EngFormatter(unit.replace("1", "")) if "^" not in unit else None
+        bar = figure.colorbar(ScalarMappable(norm, palette), ax=axes, format=shown)
+        bar.outline.set_visible(False)
+        bar.ax.set_title(colour, fontsize=drawing.FONT, loc="left", parse_math=False)
+        bar.ax.tick_params(labelsize=drawing.FONT - 0.5)
+    told = f"{lines.size:,} of {wave.line.size:,} runs" if lines.size < wave.line.size else f"{wave.line.size:,} runs"
+    told += "".join(f"; dashes by {name}" for name in dashed[:1])
+    drawing.caption(figure, f"{found.attrs['title']} · {told}")
+    figure.align_ylabels(axes)
+    return figure
 
 
 _ROOM = 90  # Letters of a legend across the page; beside other panels one curve needs none

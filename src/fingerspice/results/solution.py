@@ -20,7 +20,16 @@ from fingerspice.circuit.describe import head_lines
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.measures import Measuring
 from fingerspice.results.outcome import ErrorEstimate, Failure, Plan, State, Status
-from fingerspice.results.record import Sealed, Signalled, Signals, attribute, kept_rows, signal_of, variables
+from fingerspice.results.record import (
+    Sealed,
+    Signalled,
+    Signals,
+    amount_text,
+    attribute,
+    kept_rows,
+    signal_of,
+    variables,
+)
 from fingerspice.results.steps import Outputs, Stretch
 from fingerspice.waveforms.waveform import as_waveform
 
@@ -577,7 +586,5 @@ def _row(name: str, s: dict[str, Any]) -> tuple[str, ...]:
             continue
         # A mean that is 0 to round-off is written as 0.
         value = 0.0 if abs(value) <= 1e-12 * s[f"{name}_peak"] else value
-        # An area takes no prefix, which would be squared with its unit, and a coefficient has none.
-        plain = {"m^2": f"{1e6 * value:.4g} mm^2", "1": f"{value:.4g}"}
-        cells.append(plain.get(signal.unit) or format_si(value, signal.unit))
+        cells.append(amount_text(value, signal.unit))
     return tuple(cells)

@@ -6,7 +6,7 @@ import math
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.simulation import simulate
 from fingerspice.solve.starting import start_voltage, starts_uncharged
+from fingerspice.studies.steps import places, scene_of
 from fingerspice.waveforms.periodic import PWL, Pulse
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import DC, Exp, Sine, Waveform, refuse, require
@@ -48,6 +49,7 @@ _OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
 # Points per shortest time scale of a waveform: between them, a sine is off by 5e-6 of its amplitude. Most points of a
 # source, and how many are few.
 _DENSITY, _MOST, _FEW = 1000, 2_000_000, 1000
+_MOST_STEPS = 200  # Runs of steps in one deck
 # Error of the areas of another contact law than the paper's, relative; parameters of a GAP beside such a table.
 _OF_TABLE, _OF_TABLES = 1e-6, ("d", "eps_r", "r", "a_fix", "tau")
 
@@ -56,6 +58,7 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     """A deck that ngspice 39 runs without other files.
 
     The deck contains the devices' subcircuits, numbers in place of parameters, and PWL for sources that ngspice lacks.
+    The runs of `.step`, which ngspice lacks, stand side by side: names of the first one end in ``_1``.
 
     Parameters
     ----------
@@ -66,9 +69,11 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     Raises
     ------
     InputError
-        If a source has to be written as points and the circuit has no .tran line, or if two names would become equal.
+        If a source has to be written as points and the circuit has no .tran line, if two names would become equal, or
+        if there are too many steps.
     """
     require_circuit(circuit)
+    circuit, stepped = _side_by_side(circuit) if circuit.steps else (circuit, [])
     law = charge_law or circuit.charge_law or "local"
     require(law in LIBRARIES, "charge_law", repr(law), " or ".join(map(repr, LIBRARIES)))
     nodes = {n: _name(n) for e in circuit.elements for n in e.node_names}
@@ -89,6 +94,7 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     if circuit.overrides:
         changed = ", ".join(f"{k} = {v}" for k, v in circuit.overrides.items())
         lines.append(f"* Changed from the deck: {' '.join(changed.split())}"[:1000])
+    lines += stepped
     if circuit.measures or circuit.fourier:
         lines.append("* The deck's .meas and .four lines are left out.")
     for element in circuit.elements:
@@ -108,6 +114,26 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
             lines += _table(_element_name(circuit[name]), contact, reach)
     lines += [_OPTIONS, ".end", ""]
     return "\n".join(lines)
+
+
+def _side_by_side(circuit: Circuit) -> tuple[Circuit, list[str]]:
+    """The circuit of all steps, with a number at the end of every name, and lines that say what each number is."""
+    scenes, elements = places(circuit.steps), list[Element]()
+    refuse(len(scenes) > _MOST_STEPS, f"{len(scenes):,} steps; allowed in an export: {_MOST_STEPS}")
+    initial, lines = dict[str, float](), list[str]()
+    for number, place in enumerate(scenes, 1):
+        scene = scene_of(circuit, place)
+        refuse(scene.tran != circuit.tran, "the steps change .tran; allowed in an export: steps of the same run")
+        named = {node: node if node == "0" else f"{node}_{number}" for e in scene.elements for node in e.nodes}
+        initial |= {named[node]: value for node, value in scene.initial.items()}
+        for e in scene.elements:
+            nodes = tuple(named[node] for node in e.nodes)
+            written = tuple(
+                w if node == "0" else f"{w}_{number}" for w, node in zip(e.node_names, e.nodes, strict=True)
+            )
+            elements.append(replace(e, name=f"{e.name}_{number}", nodes=nodes, node_names=written))
+        lines.append(f"* _{number}: {', '.join(f'{one.name} = {value:g}' for one, value in place.items())}")
+    return replace(circuit, elements=tuple(elements), initial=initial, measures=(), fourier=(), steps=()), lines
 
 
 def _table(name: str, contact: LawContact, reach: float) -> list[str]:

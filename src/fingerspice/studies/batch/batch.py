@@ -34,11 +34,12 @@ if TYPE_CHECKING:
 # Kinds of figures.
 _KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
 # The signal and the kind of every output.
-_OUTPUTS = {f"{signal}_{kind}": (signal, kind) for signal in DERIVED for kind in _KINDS}
-_OUTPUTS["u_gap"] = "u_gap", ""
+OUTPUTS = {f"{signal}_{kind}": (signal, kind) for signal in DERIVED for kind in _KINDS}
+OUTPUTS["u_gap"] = "u_gap", ""
 LEAST_RTOL = 1e-12
 ONE_BY_ONE, REFUSED, FAILED = 1, 2, 3
 STATUS_NAMES = ("lockstep", "one_by_one", "refused", "failed")
+STATUS = {"flag_values": [*range(len(STATUS_NAMES))], "flag_meanings": " ".join(STATUS_NAMES)}  # Attributes of `status`
 # A relative change of a parameter by which it is seen whether the source's tone depends on it.
 _SEEN = 1e-3
 # Largest number of failure messages that a Dataset keeps, and of gap voltages (8 GB) that a batch may return.
@@ -77,7 +78,7 @@ class Task:
         require(self.points % 2 == 0, "points", self.points, "an even number, 2 or more")
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in self.outputs:
-            if name not in _OUTPUTS:
+            if name not in OUTPUTS:
                 kinds, signals = ", ".join(f"_{kind}" for kind in _KINDS), ", ".join(DERIVED)
                 raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
         require(bool(self.outputs), "outputs", "empty", "one or more names")
@@ -384,7 +385,7 @@ def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> t
     error = max((x / size for x, size in zip((off.u_gap, off.f_el), sizes, strict=True) if size > 0.0), default=0.0)
     if not paths:
         # What there is not is None, and so NaN.
-        values = {name: np.asarray(run._figure(*_OUTPUTS[name]), float) for name in task.outputs if name != "u_gap"}
+        values = {name: np.asarray(run._figure(*OUTPUTS[name]), float) for name in task.outputs if name != "u_gap"}
         if task.traced:
             values["u_gap"] = np.atleast_1d(np.asarray(run.u_gap, float))[: -1 if task.periodic else None]
         return values, error
@@ -407,16 +408,15 @@ def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], 
     from xarray import Dataset
 
     known = task.circuit.parameters
-    meanings = {"flag_values": list(range(len(STATUS_NAMES))), "flag_meanings": " ".join(STATUS_NAMES)}
     data: dict[str, Any] = {}
     for name in task.outputs:
-        signal, kind = _OUTPUTS[name]
+        signal, kind = OUTPUTS[name]
         dims, values = ("scene", "gap") if kind else ("scene", "turn", "gap"), task.values[name]
         unit = "deg" if kind == "phase_deg" else SIGNALS[signal][0]
         text = name.replace(signal, SIGNALS[signal][1], 1)
         data[name] = (dims[: values.ndim], values, {"units": unit, "long_name": text})
     data["error"] = ("scene", task.error, {"units": "1", "long_name": "stated error, relative"})
-    data["status"] = ("scene", task.status, meanings)
+    data["status"] = ("scene", task.status, STATUS)
     coords: dict[str, Any] = {path: ("scene", array, {"units": known[path].unit}) for path, array in scenes.items()}
     if task.traced:
         turns = np.arange(task.values["u_gap"].shape[1]) / task.points
@@ -430,7 +430,7 @@ def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], 
             data[f"d_{name}"] = (("scene", "parameter"), values, of)
         told = "stated error of a derivative times its parameter, relative to the output"
         data["gradient_error"] = ("scene", slopes.error, {"units": "1", "long_name": told})
-        data["gradient_status"] = ("scene", slopes.status, meanings)
+        data["gradient_status"] = ("scene", slopes.status, STATUS)
         about |= {"ordinary_gradients": slopes.ordinary, "n_ordinary_gradients": slopes.n_ordinary}
         paths, messages = list(slopes.paths), messages | slopes.messages
         coords |= {"parameter": paths, "parameter_unit": ("parameter", [known[path].unit for path in paths])}

@@ -1,0 +1,228 @@
+"""Steps of a deck, the operating point, and what else a deck asks of `fingerspice run`."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+
+import analytic
+import fingerspice as fs
+from commands import Command
+from ngspice_tools import call_ngspice, run_ngspice
+
+DECK = """steps of a gap
+.param gap=3.5u R={{2*gap/7u*1meg}} V=200
+.include fingerspice.lib
+V1 drive 0 SIN(0 {{V}} 100)
+Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg
+Xgap top skin area GAP d={{gap}} eps_r=1 r={{R}} fn=0.5
+Xskin skin 0 area SKIN d=350u f=100
+.tran {tstep} 50m uic
+{lines}
+.end
+"""
+
+
+def deck(*lines: str, tstep: str = "100u") -> fs.Circuit:
+    return fs.parse_netlist(DECK.format(lines="\n".join(lines), tstep=tstep))
+
+
+@pytest.mark.parametrize(
+    ("line", "values"),
+    [
+        ("param gap 3u 4u 0.5u", [3e-6, 3.5e-6, 4e-6]),
+        ("gap 3u 4u 0.4u", [3e-6, 3.4e-6, 3.8e-6]),
+        ("param gap list 1u 5u 2u", [1e-6, 5e-6, 2e-6]),
+        ("dec param gap 1u 100u 2", [1e-6, 10**0.5 * 1e-6, 1e-5, 10**1.5 * 1e-6, 1e-4]),
+        ("oct Xgap.r 1meg 4meg 1", [1e6, 2e6, 4e6]),
+        ("lin Xgap.d 4u 3u -0.5u", [4e-6, 3.5e-6, 3e-6]),
+        ("V1 0 {V} {V/4}", [0.0, 50.0, 100.0, 150.0, 200.0]),
+        ("Xgap.d list {gap} {2*gap}", [3.5e-6, 7e-6]),
+    ],
+)
+def test_forms_of_step(line: str, values: list[float]) -> None:
+    (step,) = deck(f".step {line}").steps
+    np.testing.assert_allclose(step.values, values, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ([".step param gop 1 2 1"], "did you mean 'gap'"),
+        ([".step Xgop.d 1 2 1"], "'Xgop.d' is not there"),
+        ([".step temp 0 1 1"], "nothing depends on temperature"),
+        ([".step gap 1u 2u 0"], "has no values"),
+        ([".step gap 2u 1u 1u"], "has no values"),
+        ([".step gap list"], "list without values"),
+        ([".step dec gap 0 1 5"], "values above 0"),
+        ([".step gap 1u 2u 1p"], "1e+06 values; allowed: 100,000"),
+        ([".step gap 1u 2u 1n", ".step R 1k 2k 1"], "in all; allowed: 100,000"),
+        ([".step gap 1u 2u"], "increment"),
+        ([".step gap 1u 2u 1u 3u"], "'3u' is not understood"),
+        ([".step gap 1u 2u 1u"] * 2, "steps gap twice"),
+        ([f".step {p} list 1 2" for p in ("gap", "R", "V", "Xcoat.d")], "4 .step lines; allowed: three"),
+        ([".dc V1 0 1"], "increment"),
+        ([".dc"], "what is stepped"),
+    ],
+)
+def test_bad_steps(lines: list[str], said: str) -> None:
+    with pytest.raises(fs.InputError, match=r"(?s).*" + said.replace("(", r"\(").replace("+", r"\+")):
+        deck(*lines)
+
+
+def test_steps_equal_single_runs() -> None:
+    """Signals, figures and measures of nested steps, of a parameter and of a path, are those of runs one by one."""
+    circuit = deck(".step param gap 3u 4u 0.5u", ".step Xskin.d list 200u 350u", ".meas tran most MAX F_EL(Xgap)")
+    found, single = fs.run_steps(circuit, rtol=1e-7), deck(".meas tran most MAX F_EL(Xgap)")
+    assert found.sizes == {"gap": 3, "Xskin.d": 2, "time": 501}
+    assert found["Xskin.d"].attrs["units"] == "m"
+    for i, gap in enumerate((3e-6, 3.5e-6, 4e-6)):
+        for k, d in enumerate((200e-6, 350e-6)):
+            one = fs.simulate(
+                single.replace({"Xgap.d": gap, "Xgap.r": 2.0 * gap / 7e-6 * 1e6, "Xskin.d": d}), rtol=1e-7
+            )
+            np.testing.assert_allclose(found.u_gap[i, k], one.u_gap, rtol=0.0, atol=1e-9)
+            assert found.f_el_mean[i, k].item() == pytest.approx(one.f_el_mean, rel=1e-9)
+            assert found.most[i, k].item() == pytest.approx(one.measures["most"], rel=1e-9)
+
+
+@pytest.mark.parametrize("line", [".step Xgap.d 3u 4u 10n", ".step param gap 3u 4u 10n"])
+def test_figures_go_as_one_batch(line: str) -> None:
+    """Without signals all steps go in lockstep, with the figures that single runs have."""
+    circuit = deck(line)
+    found = fs.run_steps(circuit, signals=(), rtol=1e-6)
+    assert found.status.size == 101
+    assert not found.status.any()
+    changes = {"Xgap.d": 3.7e-6} | ({"Xgap.r": 2.0 * 3.7e-6 / 7e-6 * 1e6} if "param" in line else {})
+    one = fs.simulate(deck().replace(changes), rtol=1e-9)
+    assert found.f_el_mean[70].item() == pytest.approx(one.f_el_mean, rel=1e-6)
+    assert found.u_gap_rms[70].item() == pytest.approx(one.u_gap_rms, rel=1e-6)
+
+
+@pytest.mark.parametrize("signals", [(), None])
+def test_a_bad_value_is_told_and_the_others_stand(signals: tuple[str, ...] | None) -> None:
+    found = fs.run_steps(deck(".step Xgap.d list 3u -1u 4u"), signals=signals, rtol=1e-5)
+    assert [x > 1 for x in found.status.values.tolist()] == [False, True, False]
+    assert np.isfinite(found.f_el_mean.values).tolist() == [True, False, True]
+    assert "Xgap.d = -1e-06" in found.attrs["failures"][0]
+    assert "allowed: more than 0" in found.attrs["failures"][0]
+
+
+def test_changes_of_the_user_stay() -> None:
+    """What `replace` has set keeps its value where a parameter of the deck is stepped."""
+    circuit = deck(".step param gap list 3u 4u").replace({"Xgap.r": 5e5})
+    found = fs.run_steps(circuit, rtol=1e-7)
+    one = fs.simulate(deck().replace({"Xgap.r": 5e5, "Xgap.d": 4e-6}), rtol=1e-7)
+    np.testing.assert_allclose(found.u_gap[1], one.u_gap, rtol=0.0, atol=1e-9)
+
+
+def test_a_source_and_the_end_of_a_run_are_stepped() -> None:
+    """A source's own name is its level, and a run that ends earlier has NaN after its end."""
+    text = DECK.format(lines=".step V1 list 10 20", tstep="1m").replace("SIN(0 {V} 100)", "{V}")
+    found = fs.run_steps(fs.parse_netlist(text))
+    assert found.u_source.values[:, -1].tolist() == [10.0, 20.0]
+    text = (
+        DECK.format(lines=".step param end list 20m 40m", tstep="1m")
+        .replace("50m", "{end}")
+        .replace("V=200", "V=200 end=1")
+    )
+    found = fs.run_steps(fs.parse_netlist(text))
+    assert np.isfinite(found.u_gap.values).sum(axis=1).tolist() == [21, 41]
+    bad = fs.run_steps(
+        fs.parse_netlist(DECK.format(lines=".step param h list 1m 2m", tstep="{h}").replace("V=200", "V=200 h=1u"))
+    )
+    assert "other times" in bad.attrs["failures"][0]
+
+
+def test_refused_requests() -> None:
+    with pytest.raises(fs.InputError, match=r"no \.step line"):
+        fs.run_steps(deck())
+    with pytest.raises(fs.InputError, match="allowed: figures such as"):
+        fs.run_steps(deck(".step gap list 1u 2u"), outputs=("f_el_men",))
+    with pytest.raises(fs.InputError, match="u_gap is the name of a step or measure"):
+        fs.run_steps(deck(".step gap list 1u 2u", ".meas tran u_gap MAX V(top)"))
+    with pytest.raises(fs.InputError, match="fewer outputs or signals"):
+        fs.run_steps(deck(".step gap 1u 2u 0.1n", tstep="10n"))
+    with pytest.raises(fs.InputError, match="no step has a result; the first: gap = -1"):
+        fs.run_steps(deck(".step gap list -1 -2"))
+    with pytest.warns(fs.FingerspiceWarning, match=r"\.step has no effect in one run"):
+        fs.simulate(deck(".step gap list 1u 2u"), rtol=1e-4)
+
+
+def test_operating_points_against_their_equations() -> None:
+    """Resistances in series, that of the skin over the area, which follows the gap voltage."""
+    found = fs.operating_points(deck(".dc V1 0 100 25 Xgap.d 3u 4u 1u"))
+    assert found.sizes == {"V1": 5, "Xgap.d": 2}
+    for i, volts in enumerate((0.0, 25.0, 50.0, 75.0, 100.0)):
+        for k, d in enumerate((3e-6, 4e-6)):
+            params = replace(analytic.TABLE1, d_a=d)
+            layers = analytic.table1_layers(100.0, params)
+            expected = analytic.dc_operating_point(volts, layers, params)
+            at = found.isel({"V1": i, "Xgap.d": k})
+            np.testing.assert_allclose(
+                [at["u_layer:Xcoat"], at["u_gap"], at["u_layer:Xskin"]], expected, rtol=1e-9, atol=1e-12
+            )
+            assert at.area.item() == pytest.approx(float(analytic.area(expected[1], params)), rel=1e-9)
+
+
+def test_operating_point_equals_ngspice(tmp_path: Path) -> None:
+    text = DECK.format(lines=".op", tstep="100u").replace("SIN(0 {V} 100)", "120").replace(".tran 100u 50m uic\n", "")
+    circuit = fs.parse_netlist(text)
+    found = fs.operating_points(circuit)
+    control = ".control\nop\nprint v(top) v(skin) v(area)\nquit 0\n.endc\n.end"
+    (tmp_path / "op.cir").write_text(fs.export_netlist(circuit).rpartition(".end")[0] + control)
+    said = call_ngspice(tmp_path, "op.cir").stdout
+    theirs = {line.split(" = ")[0]: float(line.split(" = ")[1]) for line in said.splitlines() if line.startswith("v(")}
+    assert found["v:top"].item() == pytest.approx(theirs["v(top)"], rel=1e-5)
+    assert found["v:skin"].item() == pytest.approx(theirs["v(skin)"], rel=1e-5)
+    assert 1e6 * found["area"].item() == pytest.approx(theirs["v(area)"], rel=1e-5)
+
+
+def test_steps_side_by_side_in_ngspice() -> None:
+    """The export has all runs, and ngspice finds what they are here."""
+    circuit = deck(".step param gap list 3u 4u", ".step V list 100 200", tstep="50u")
+    circuit = fs.parse_netlist(circuit.text.replace("50m", "10m"))
+    names = [f"v(top_{k})-v(skin_{k})" for k in range(1, 5)]
+    theirs = run_ngspice(fs.export_netlist(circuit), names, max_step=1e-6)
+    found = fs.run_steps(circuit, signals=("u_gap",)).u_gap
+    for name, ours in zip(names, found.values.reshape(4, -1), strict=True):
+        other = np.interp(found.time, theirs["time"], theirs[name])
+        assert np.abs(ours - other)[1:].max() <= 1e-6 * np.abs(ours).max()
+    with pytest.raises(fs.InputError, match="501 steps; allowed in an export: 200"):
+        fs.export_netlist(deck(".step gap 1u 6u 10n"))
+
+
+def test_run_writes_steps_and_analyses(command: Command) -> None:
+    """The command writes a family of curves, and what `.op`, `.dc` and `.ac` ask for; a bad step is a warning."""
+    lines = (".step gap list 3u -1u 4u", ".op", ".dc V1 0 200 50", ".ac dec 5 10 10k", ".meas tran most MAX F_EL(Xgap)")
+    Path("steps.cir").write_text(DECK.format(lines="\n".join(lines), tstep="100u"))
+    done = command("run", "steps.cir", "--json")
+    assert done.code == 0
+    answer = json.loads(done.out)
+    assert [one["status"] for one in answer["steps"]] == ["one_by_one", "refused", "one_by_one"]
+    assert answer["steps"][2]["figures"]["most"] > 0.1
+    assert "gap = -1e-06" in done.err
+    assert len(answer["dc"]) == 5
+    assert answer["op"]["u_gap"] == 0.0
+    assert len(answer["sweeps"][0]["frequency"]) == 16
+    names = sorted(path.name for path in Path("out").iterdir() if path.name[0] != ".")
+    assert names == ["steps.nc", "steps.png", "steps_ac.csv", "steps_ac.png", "steps_dc.csv", "steps_dc.png"]
+    with xarray.open_dataset("out/steps.nc", engine="h5netcdf") as kept:
+        assert math.isnan(kept.most[1])
+        assert kept.u_gap.dims == ("gap", "time")
+    refused = command("run", "steps.cir", "--raw")
+    assert refused.code == 2
+    assert "--raw goes with one run" in refused.err
+    assert ".step has no effect in one run" in command("plan", "steps.cir").err
+
+
+def test_a_deck_without_tran(command: Command) -> None:
+    Path("op.cir").write_text(DECK.format(lines=".op\n.dc V1 0 200 50", tstep="1u").replace(".tran 1u 50m uic\n", ""))
+    done = command("run", "op.cir")
+    assert done.code == 0
+    assert "operating point" in done.out
+    assert Path("out/op_dc.png").is_file()
