@@ -19,13 +19,13 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along. Contact laws raised them
-# by 1,243 where 1,200 were given; SPICE's directives have used 1,593 of 2,500.
-ALL_LINES = 37_429
+# by 1,243 where 1,200 were given; SPICE's directives have used 1,984 of 2,500.
+ALL_LINES = 37_541
 ALL_FILES = 135
 PACKAGE_LINES = {
-    "base": 1_028, "circuit": 2_408, "cli": 1_586, "engine": 7_182, "explorer": 1_168, "netlist": 2_600,
-    "numerics": 1_170, "physics": 807, "plots": 1_285, "results": 3_151, "sets": 361, "solve": 5_368,
-    "studies": 6_545, "torch": 375, "waveforms": 2_239,
+    "base": 1_028, "circuit": 2_411, "cli": 1_588, "engine": 7_182, "explorer": 1_168, "netlist": 2_601,
+    "numerics": 1_170, "physics": 807, "plots": 1_285, "results": 3_244, "sets": 361, "solve": 5_368,
+    "studies": 6_558, "torch": 375, "waveforms": 2_239,
 }  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.

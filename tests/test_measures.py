@@ -193,11 +193,64 @@ def test_wrong_measures_are_refused_with_their_place(line: str, said: str) -> No
 
 @pytest.mark.parametrize(("line", "said"), WITHOUT.items())
 def test_a_measure_without_a_value_says_why_and_the_others_stand(line: str, said: str) -> None:
-    found = measured(".meas tran m0 MAX V(b)", f".meas tran m1 {line}", ".meas tran m2 PP V(b)", ".meas ac m3 MAX V(b)")
+    found = measured(
+        ".meas tran m0 MAX V(b)", f".meas tran m1 {line}", ".meas tran m2 PP V(b)", ".meas noise m3 MAX V(b)"
+    )
     assert math.isnan(found["m1"].value)
     assert said in found["m1"].failed
     assert found["m2"].value == pytest.approx(1.0, rel=1e-12)
-    assert found["m3"].failed == "a measure of AC is not made here"
+    assert found["m3"].failed == "a measure of NOISE is not made here"
+
+
+# An RC of 1 ms under 2 V: V(out) is 2 / (1 + i x) with x = f/F, and V(in, out) is 2 i x / (1 + i x).
+F = 1000.0 / (2.0 * math.pi)
+SWEPT = {
+    "FIND V(out) AT={F}": 1.0, "FIND VI(out) AT={F}": -1.0, "FIND VM(out) AT={F}": math.sqrt(2.0),
+    "FIND VDB(out) AT={F}": 10.0 * math.log10(2.0), "FIND VP(out) AT={F}": -0.25 * math.pi,
+    "WHEN VDB(out)=0": F * math.sqrt(3.0), "FIND VR(out) WHEN VM(out)=1 FALL=1": 0.5,
+    "MAX VM(out)": 2.0 / math.hypot(1.0, 1.0 / F), "MIN_AT VM(out)": 1e4, "MAX {-VI(out)}": 1.0, "MAX_AT {-VI(out)}": F,
+    "PP VM(out)": 2.0 / math.hypot(1.0, 1.0 / F) - 2.0 / math.hypot(1.0, 1e4 / F),
+    "INTEG VM(out) FROM=10 TO=1k": 2.0 * F * (math.asinh(1e3 / F) - math.asinh(10.0 / F)),
+    "RMS VM(out) FROM=10 TO=1k": math.sqrt(4.0 * F * (math.atan(1e3 / F) - math.atan(10.0 / F)) / 990.0),
+    "DERIV VM(out) AT={F}": -1.0 / (math.sqrt(2.0) * F),
+    "TRIG VDB(out) VAL=5 FALL=1 TARG VDB(out) VAL=0 FALL=1":
+        F * (math.sqrt(3.0) - math.sqrt(4.0 / 10.0**0.5 - 1.0)), "PARAM='m2*m2'": 2.0,
+}  # fmt: skip
+
+
+def test_measures_of_a_sweep_are_their_closed_forms_and_those_of_ngspice(command: Any) -> None:
+    lines = [f".meas ac m{k} {form.replace('{F}', repr(F))}" for k, form in enumerate(SWEPT)]
+    circuit = deck("V1 in 0 AC 2", "R1 in out 1k", "C1 out 0 1u", ".ac dec 20 1 10k", *lines)
+    found = fs.phasor(circuit, 10.0 ** np.linspace(0.0, 4.0, 81))
+    for k, (form, expected) in enumerate(SWEPT.items()):
+        assert found.measures[f"m{k}"] == pytest.approx(expected, rel=1e-10), form
+    # ngspice has no DERIV, and no expressions in place of vectors.
+    text = re.sub(r"(?m)^\.meas ac \w+ (DERIV|.*\{).*\n", "", circuit.text.replace("dec 20", "dec 2000"))
+    theirs = of_ngspice(text)
+    for k, (form, expected) in enumerate(SWEPT.items()):
+        if f"m{k}" in theirs:
+            assert theirs[f"m{k}"] == pytest.approx(expected, rel=2e-5), form
+    assert len(theirs) >= 12
+    Path("rc.cir").write_text(circuit.text)
+    for words in (("run", "rc.cir"), ("ac", "rc.cir")):
+        shown = command(*words, "--no-plot").out
+        assert "measure" in shown
+        assert "159.2 Hz" in shown
+    rows = json.loads(command("ac", "rc.cir", "--no-plot", "--json").out)["sweeps"][0]["measures"]
+    assert rows[5]["value"] == pytest.approx(F * math.sqrt(3.0), rel=1e-10)
+
+
+def test_measures_of_a_finger_in_a_sweep() -> None:
+    lines = "top WHEN u_gap(Xgap)=140", "f FIND F_EL(Xgap) AT=230", "no MAX friction(Xgap)"
+    text = "".join(f".meas ac {line}\n" for line in lines)
+    circuit = fs.parse_netlist(table1().text.replace(".tran", f"{text}.tran"))
+    found = fs.phasor(circuit, np.geomspace(10.0, 1e4, 31))
+    at = fs.phasor(circuit, [found.measures["top"], 230.0])
+    assert abs(at.u_gap[0]) == pytest.approx(140.0, rel=1e-9)
+    assert found.measures["f"] == pytest.approx(at.f_el_mean[1], rel=1e-9)
+    assert "no part of a sweep" in found.measured["no"].failed
+    v_top = at.v_nodes[:, at.nodes.index("top")] - at.v_nodes[:, at.nodes.index("skin")]
+    np.testing.assert_allclose(v_top, at.u_gap, rtol=1e-12)
 
 
 def test_harmonics_are_those_of_the_closed_form_and_of_ngspice() -> None:

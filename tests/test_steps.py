@@ -214,6 +214,12 @@ def test_run_writes_steps_and_analyses(command: Command) -> None:
     with xarray.open_dataset("out/steps.nc", engine="h5netcdf") as kept:
         assert math.isnan(kept.most[1])
         assert kept.u_gap.dims == ("gap", "time")
+    again = command("run", "steps.cir", "--csv", "--no-plot")
+    assert again.code == 0
+    assert command("run", "steps.cir", "--csv", "--no-plot").code == 0
+    assert Path("out/steps.csv").read_text().splitlines()[0] == (
+        "gap,u_gap_rms [V],f_el_mean [N],f_t_mean [N],most,status"
+    )
     refused = command("run", "steps.cir", "--raw")
     assert refused.code == 2
     assert "--raw goes with one run" in refused.err

@@ -12,6 +12,8 @@ OF_DEVICES: Mapping[str, str] = {
     "u_gap": "u_gap", "f_el": "f_el", "f_t": "f_t", "friction": "friction", "area": "area", "sigma_el": "sigma_el",
     "a_real": "a_real", "u": "u_layer",
 }  # fmt: skip
+#: Parts of a node's phasor in SPICE's words; the phase is in radians.
+PARTS = ("v", "vr", "vi", "vm", "vp", "vdb")
 EDGES = ("rise", "fall", "cross")
 LAST = -1  #: The number of a crossing that is the last one.
 
@@ -57,7 +59,7 @@ class Measure:
     """One `.meas` line; what is not measurable has its reason in `refused`."""
 
     name: str
-    kind: str  # A key of `fingerspice.results.measures.MEASURES`
+    kind: str  # A form in lower case, such as ``avg``
     of: Quantity | None = None
     start: Crossing | None = None  # When it is measured, or where a delay begins
     stop: Crossing | None = None  # Where a delay ends
@@ -66,3 +68,4 @@ class Measure:
     needs: tuple[str, ...] = ()  # Other measures, in lower case, of which `formula` is a function
     formula: Callable[[Mapping[str, float]], float] | None = field(default=None, compare=False)  # Of other measures
     refused: str = ""
+    analysis: str = "tran"  # Or ``ac``: times are frequencies (Hz) then

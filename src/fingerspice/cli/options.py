@@ -32,11 +32,12 @@ from fingerspice.waveforms.waveform import refuse, require
 LARGEST_AREA = 0.01  # Largest area that causes no warning, m^2; a larger one was probably given in mm^2
 LONGEST_SOURCE = 1000  # Largest number of characters of a source's numbers that are stored with the results
 FOLDER = Path("out")  # Folder of the results unless another one is named
-#: First bytes of the tables that the commands write.
+#: First bytes of the tables that the commands write, and last ones of the heads of those about steps.
 _HEADS = (
-    b"t [s],u_source", b"frequency [Hz],gain [1],", b"parameter,value [SI],unit,", b"time (s),drive (V)",
+    b"t [s],u_source", b"frequency [Hz],gain [1],", b"frequency [Hz],v:", b"parameter,value [SI],unit,", b"time (s),drive (V)",
     b"time (s),wanted force (N),",
 )  # fmt: skip
+_TAIL = b",status"
 SETS = ("set", "finger", "coating", "drive")  # Options that name sets of parameters
 _SET = "Apply a named set of this kind: {} (list: fingerspice sets)."
 _SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
@@ -202,7 +203,8 @@ class Job:
         except (OSError, ValueError, KeyError, TypeError, AttributeError, SyntaxError):
             # The file was not written by this package, or is a table; beside a WAV file there is such a table.
             with suppress(OSError), (file.with_suffix(".csv") if file.suffix == ".wav" else file).open("rb") as stream:
-                if stream.read(100).startswith(_HEADS):
+                head = stream.readline(10_000).rstrip()
+                if head.startswith(_HEADS) or head.endswith(_TAIL):
                     complain(f"note: {file} is replaced; a table alone does not say which circuit it is of")
                     return False
             raise InputError(f"{file} is there already, and nothing says which circuit it is of; {ways}") from None

@@ -10,7 +10,7 @@ from functools import partial
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import Element, Step
-from fingerspice.circuit.measures import EDGES, LAST, OF_DEVICES, Crossing, Measure, Quantity, Vector
+from fingerspice.circuit.measures import EDGES, LAST, OF_DEVICES, PARTS, Crossing, Measure, Quantity, Vector
 from fingerspice.netlist.expressions import CONSTANTS, FUNCTIONS, Problem, compiled, evaluated
 from fingerspice.netlist.lexer import Line, nearest
 from fingerspice.waveforms.waveform import refuse
@@ -22,7 +22,7 @@ _ALIASES = {"integral": "integ", "derivative": "deriv", "average": "avg"}
 FORMS = "AVG RMS MIN MAX PP INTEG MIN_AT MAX_AT FIND DERIV WHEN TRIG PARAM"
 # Words at which a vector or an expression of vectors has ended.
 _STOPS = ("=", "from", "to", "at", "when", "val", "td", "targ", *EDGES)
-_OTHERS = ("ac", "dc", "op", "noise", "tf", "sp")  # Analyses of which nothing is measured here
+_OTHERS = ("dc", "op", "noise", "tf", "sp")  # Analyses of which nothing is measured here
 
 
 def _of_vectors(text: str, params: Mapping[str, float], *x: float) -> float:
@@ -44,7 +44,7 @@ class _Line:
         self.line, self.params, self.elements, self.name = line, params, elements, name
         self.words = [(m.lastgroup or "", m[m.lastgroup or 0], m.start(m.lastgroup or 0))
                       for m in _WORDS.finditer(line.text, start)]  # fmt: skip
-        self.at = 0
+        self.at, self.ac = 0, False
 
     @property
     def where(self) -> Where:
@@ -147,7 +147,7 @@ class _Line:
             # A comma within brackets belongs to a name.
             inside = [part.strip() for part in re.split(r",(?![^(]*\))", rest[:-1])]
         key = key.lower()
-        if key == "v":
+        if key in (PARTS if self.ac else PARTS[:1]):
             known = {node: None for e in self.elements for node in e.nodes} | {"0": None, "gnd": None}
             names = tuple("0" if name.lower() == "gnd" else name.lower() for name in inside)
             what, wrong = "node", next((name for name in names if name not in known), None)
@@ -211,9 +211,10 @@ def read_measure(
     words = _Line(line, start, params, elements)
     analysis = words.take("the analysis, such as TRAN")[1].lower()
     name = words.take("the measure's name")[1]
-    refuse(analysis not in ("tran", *_OTHERS), f".meas {analysis!r}; allowed: TRAN", line.where(start))
+    refuse(analysis not in ("tran", "ac", *_OTHERS), f".meas {analysis!r}; allowed: TRAN or AC", line.where(start))
+    words.ac = analysis == "ac"
     refuse(any(one.name.lower() == name.lower() for one in before), f".meas {name} is given twice", line.where(start))
-    if analysis != "tran":
+    if analysis in _OTHERS:
         return Measure(name, "none", refused=f"a measure of {analysis.upper()} is not made here")
     kind = words.take("what is measured")[1].lower()
     kind = _ALIASES.get(kind, kind)
@@ -245,7 +246,7 @@ def read_measure(
     if words.at < len(words.words):
         raise InputError(f".meas {name}: {words.peek()!r} is not understood here", words.where)
     since, until = window.get("from", window.get("td")), window.get("to")
-    return Measure(name, kind, of, start_at, stop_at, since, until, needs, formula)
+    return Measure(name, kind, of, start_at, stop_at, since, until, needs, formula, analysis=analysis)
 
 
 def read_fourier(

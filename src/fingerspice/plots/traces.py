@@ -398,7 +398,7 @@ def stems(
 
 def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     """Gain, phase, mean force and area against frequency, with a line per amplitude; without a GAP the nodes."""
-    one, nodes = results[0], results[0].nodes
+    one, nodes = results[0], results[0].shown_nodes
     low, high = float(one.frequency.min()), float(one.frequency.max())
     figure, axes = drawing.new_figure(2, 1 if nodes else 2, height=4.6, sharex=True)
     factor, unit = drawing.engineering(drawing.peak_of(np.nan_to_num([r.f_el_mean for r in results])), "N", 0.05)

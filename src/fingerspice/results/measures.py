@@ -14,16 +14,18 @@ from numpy.polynomial import chebyshev
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.pages import Table
 from fingerspice.base.units import format_si
-from fingerspice.circuit.measures import LAST, Crossing, Measure, Quantity, Vector
+from fingerspice.circuit.measures import LAST, PARTS, Crossing, Measure, Quantity, Vector
 from fingerspice.circuit.network import network_of
-from fingerspice.numerics.lobatto import NODES, TO_SERIES
+from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
 from fingerspice.results.record import Signals
-from fingerspice.results.steps import Outputs, Stretch, Weighed, weigh_outputs
+from fingerspice.results.steps import WEIGHTS, Outputs, Stretch, Weighed, weigh_outputs
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.solution import Solution
+    from fingerspice.results.spectrum import PhasorSolution
 
+_MOST_PIECES = 60  # Of a sweep, with as many polynomials
 _TOLERANCE = 1e-12  # Of the polynomials in which crossings are looked for, relative to the peak
 
 
@@ -106,8 +108,6 @@ class _Course:
     """A quantity between two times (s), as Chebyshev series on consecutive pieces."""
 
     def __init__(self, solution: Solution, quantity: Quantity, since: float, until: float) -> None:
-        if not since < until:
-            raise Failed(f"its window from {since:g} to {until:g} s is empty")
         self.values, self.since, self.until = values_of(solution, quantity), since, until
         # Currents of sources are known at the outputs only.
         of_sources = any(one.kind == "i" and solution.circuit[one.names[0]].device in "VI" for one in quantity.vectors)
@@ -180,11 +180,84 @@ class _Course:
                     before = sign
 
 
-def _time(solution: Solution, crossing: Crossing, since: float, until: float) -> float:
+class _Swept(_Course):
+    """A quantity between two frequencies (Hz), from phasors at the nodes of polynomials between those of a sweep."""
+
+    def __init__(self, sweep: Sweep, quantity: Quantity, since: float, until: float) -> None:
+        inside = sweep.frequency[(sweep.frequency > since) & (sweep.frequency < until)]
+        inside = inside[:: 1 + inside.size // _MOST_PIECES]
+        edges = np.r_[since, inside, until]
+        self.since, self.until, self.begin, self.length = since, until, edges[:-1], np.diff(edges)
+        nodes = self.begin[:, None] + self.length[:, None] * POINTS[:NODES]
+        found = sweep.solve(nodes.ravel())
+        columns = [_part(found, vector) for vector in quantity.vectors]
+        made = columns[0] if quantity.function is None else np.vectorize(quantity.function, otypes=[float])(*columns)
+        self.t, self.x = nodes.ravel(), made
+        self.series = made.reshape(nodes.shape) @ TO_SERIES[:, :NODES]
+
+    def extreme(self, sign: float) -> tuple[float, float]:
+        best = int((sign * self.x).argmax()) // NODES
+        places = [self.since, self.until]
+        for k in range(max(best - 1, 0), min(best + 2, self.begin.size)):
+            roots = chebyshev.chebroots(chebyshev.chebder(self.series[k]))
+            within = roots.real[(np.abs(roots.imag) < 1e-8) & (np.abs(roots.real) < 1.0)]
+            places += [self.begin[k], *(self.begin[k] + 0.5 * (within + 1.0) * self.length[k])]
+        return max(((float(f), self.at(f)) for f in places), key=lambda one: sign * one[1])
+
+    def weighed(self, longest: float = math.inf) -> Weighed:
+        share = self.length[:, None] / self.length.sum()
+        return Weighed(self.t, (share * WEIGHTS).ravel(), self.x)
+
+
+def _part(found: PhasorSolution, vector: Vector) -> FloatArray:
+    """A part of the voltage between nodes, or a figure of a sweep."""
+    if vector.kind in PARTS:
+        at = dict(zip(map(str.lower, found.nodes), np.asarray(found.v_nodes).T, strict=True))
+        missing = [name for name in vector.names if name not in ("0", *at)]
+        if missing:
+            raise Failed(f"node {missing[0]} has no voltage of its own")
+        first, other = (at.get(name, np.zeros(found.frequency.size)) for name in (*vector.names, "0")[:2])
+        v = first - other
+        with np.errstate(divide="ignore"):
+            decibels = 20.0 * np.log10(np.abs(v))
+        return np.asarray({"vi": v.imag, "vm": np.abs(v), "vp": np.angle(v), "vdb": decibels}.get(vector.kind, v.real))
+    if vector.kind == "u_gap":
+        return np.abs(found.u_gap)
+    if vector.kind not in ("area", "f_el"):
+        raise Failed(
+            f"{vector.kind} of {', '.join(vector.names)} is no part of a sweep; allowed: V, VM, VDB, VP, VR, VI"
+        )
+    return found.area if vector.kind == "area" else found.f_el_mean
+
+
+class Sweep:
+    """What a measure of `.ac` needs of a sweep at frequencies (Hz): those, and the same sweep at others."""
+
+    def __init__(self, circuit: Circuit, frequency: FloatArray, solve: Callable[[FloatArray], PhasorSolution]) -> None:
+        self.circuit, self.frequency = circuit, np.unique(frequency)
+        self.first, self.t_stop = float(self.frequency[0]), float(self.frequency[-1])
+        self._solve = solve
+        self._found: dict[bytes, PhasorSolution] = {}
+
+    def solve(self, f: FloatArray) -> PhasorSolution:
+        """The sweep at other frequencies, which several measures may ask for."""
+        if (found := self._found.get(f.tobytes())) is None:
+            found = self._found[f.tobytes()] = self._solve(f)
+        return found
+
+
+def _course(run: Solution | Sweep, quantity: Quantity, since: float, until: float) -> _Course:
+    unit = "Hz" if isinstance(run, Sweep) else "s"
+    if not since < until:
+        raise Failed(f"its window from {since:g} to {until:g} {unit} is empty")
+    return (_Swept if isinstance(run, Sweep) else _Course)(run, quantity, since, until)  # type: ignore[arg-type]
+
+
+def _time(solution: Solution | Sweep, crossing: Crossing, since: float, until: float) -> float:
     """When a quantity has its value."""
     if crossing.of is None:
         return crossing.value
-    course = _Course(solution, crossing.of, max(since, crossing.since), until)
+    course = _course(solution, crossing.of, max(since, crossing.since), until)
     wanted = {"rise": (1.0,), "fall": (-1.0,), "cross": (1.0, -1.0)}[crossing.edge]
     times = [t for t, sign in course.crossings(crossing.value) if sign in wanted]
     if len(times) < max(crossing.number, 1):
@@ -203,12 +276,13 @@ class Measured(NamedTuple):
     failed: str = ""
 
 
-def _reached(solution: Solution) -> float:
-    """Time (s) up to which the run is known: its end, or where it stopped."""
-    return solution.t_stop if solution.failure is None else min(float(solution.t[-1]), solution.t_stop)
+def _reached(solution: Solution | Sweep) -> float:
+    """Time (s) up to which the run is known: its end, or where it stopped; of a sweep the last frequency."""
+    failed = not isinstance(solution, Sweep) and solution.failure is not None
+    return min(float(solution.t[-1]), solution.t_stop) if failed else solution.t_stop  # type: ignore[union-attr]
 
 
-def _made(solution: Solution, one: Measure, known: Mapping[str, float]) -> Measured:
+def _made(solution: Solution | Sweep, one: Measure, known: Mapping[str, float]) -> Measured:
     if one.refused:
         raise Failed(one.refused)
     if one.formula is not None:
@@ -233,7 +307,7 @@ def _made(solution: Solution, one: Measure, known: Mapping[str, float]) -> Measu
         assert one.start is not None
         return Measured(t := _time(solution, one.start, since, until), t)
     assert one.of is not None
-    course = _Course(solution, one.of, since, until)
+    course = _course(solution, one.of, since, until)
     if one.start is not None:
         t = _time(solution, one.start, since, until)
         return Measured(course.at(t, one.kind == "deriv"), t)
@@ -248,17 +322,25 @@ def _made(solution: Solution, one: Measure, known: Mapping[str, float]) -> Measu
     }[one.kind]  # fmt: skip
 
 
-def measured(solution: Solution) -> dict[str, Measured]:
-    """The measures of the deck, by name."""
+def measured(solution: Solution | Sweep) -> dict[str, Measured]:
+    """The deck's measures of a run or of a sweep, by name."""
     found: dict[str, Measured] = {}
-    for one in solution.circuit.measures:
+    analysis, size = ("ac", solution.frequency.size) if isinstance(solution, Sweep) else ("tran", solution.t.size)
+    for one in [one for one in solution.circuit.measures if one.analysis == analysis]:
         try:
-            if solution.t.size < 2:
+            if size < 2:
                 raise Failed("the run has no outputs")
             found[one.name] = _made(solution, one, {name.lower(): x.value for name, x in found.items()})
         except Failed as failed:
             found[one.name] = Measured(math.nan, failed=str(failed))
     return found
+
+
+def measures_table(found: Mapping[str, Measured], unit: str) -> tuple[str | Table, ...]:
+    """Blocks of a page with measures, and the times (s) or frequencies (Hz) that belong to them."""
+    rows = [(name, one.failed or f"{one.value:.6g}", "" if math.isnan(one.at) else format_si(one.at, unit))
+            for name, one in found.items()]  # fmt: skip
+    return ("", Table(("measure", "value", "at"), rows)) if rows else ()
 
 
 HARMONICS = 10  #: Of a `.four` line, the mean counted.
@@ -310,7 +392,7 @@ def _fourier(solution: Solution, quantity: Quantity, frequency: float) -> Fourie
     since = last - 1.0 / frequency
     if since < solution.first - 1e-9 / frequency:
         raise Failed(f"the run holds no whole period of {frequency:g} Hz")
-    course = _Course(solution, quantity, max(since, solution.first), last)
+    course = _course(solution, quantity, max(since, solution.first), last)
     weighed = course.weighed(0.5 / (frequency * HARMONICS))
     found = [complex(weighed.mean()), *(weighed.phasor(k * frequency) for k in range(1, HARMONICS))]
     magnitude, phase = np.abs(found), np.degrees(np.angle(found))
@@ -345,9 +427,7 @@ class Measuring:
 
     def _measures_shown(self) -> Iterator[str | Table]:
         """The blocks of measures and harmonics on a page."""
-        rows = [(name, one.failed or f"{one.value:.6g}", "" if math.isnan(one.at) else format_si(one.at, "s"))
-                for name, one in self.measured.items()]  # fmt: skip
-        yield from ("", Table(("measure", "value", "at"), rows)) if rows else ()
+        yield from measures_table(self.measured, "s")
         for name, harmonics in self.fourier.items():
             shown = harmonics if isinstance(harmonics, str) else f"total harmonic distortion {harmonics.thd:.6g} %"
             yield from ("", f"{name}: {shown}")

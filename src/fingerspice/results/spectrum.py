@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +19,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import NOTABLE, energy_outside
 from fingerspice.circuit.network import network_of
+from fingerspice.results.measures import Measured, measures_table
 from fingerspice.results.record import Sealed, signal_of
 from fingerspice.results.steps import Outputs
 from fingerspice.waveforms.waveform import refuse, require
@@ -280,7 +281,7 @@ class PhasorSolution(Shown):
     impedance : ndarray of complex or None
         Voltage of the source over its current, ohm; None for a large-signal sweep or several sources.
     nodes : tuple of str
-        Nodes of a circuit without GAP, for which figures of a gap are NaN; empty with a GAP.
+        Nodes of the circuit; none of a large signal. Without a GAP the figures of a gap are NaN.
     v_nodes : ndarray of complex or None, shape (n_frequency, n_node)
         Their complex amplitudes, V.
     """
@@ -301,6 +302,17 @@ class PhasorSolution(Shown):
     impedance: ComplexArray | None = None
     nodes: tuple[str, ...] = ()
     v_nodes: ComplexArray | None = None
+    measured: Mapping[str, Measured] = field(default_factory=dict)
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """Values of the deck's `.meas ac` lines by name, NaN where there is none; `measured` says why and where."""
+        return {name: one.value for name, one in self.measured.items()}
+
+    @property
+    def shown_nodes(self) -> tuple[str, ...]:
+        """The nodes of a circuit without GAP, which stand in tables and pictures."""
+        return () if self.circuit.by_device("GAP") else self.nodes
 
     def _columns(self) -> list[Column]:
         """The columns of its table and its file; the amplitude, without a heading, only belongs into the file."""
@@ -310,10 +322,10 @@ class PhasorSolution(Shown):
             out.append(Column(phase, "deg", np.degrees(np.angle(x)), heads[1], form=".3f"))
 
         out = [Column("frequency", "Hz", self.frequency, "frequency [Hz]", form=".6g")]
-        for i, node in enumerate(self.nodes):
+        for i, node in enumerate(self.shown_nodes):
             v = np.asarray(self.v_nodes)[:, i]
             polar(f"v:{node}", f"phase_deg:{node}", v, "V", (f"|v({node})| [V]", "phase [deg]"))
-        if not self.nodes:
+        if not self.shown_nodes:
             polar("gain", "phase_deg", self.gain, "1", ("|u_gap/U|", "phase [deg]"), ".5f")
             out.append(Column("u_gap", "V", np.abs(self.u_gap), "u_gap [V]"))
             out.append(Column("area", "m^2", self.area, "area [mm^2]", 1e6))
@@ -330,7 +342,7 @@ class PhasorSolution(Shown):
         shown = [column for column in self._columns() if column.head]
         cells = [[f"{c.factor * x:{c.form}}" for x in c.values[rows].tolist()] for c in shown]
         table = Table(tuple(column.head for column in shown), [*zip(*cells, strict=True)])
-        return Page([f"{drive}: {self.drive}", *self.notes, table])
+        return Page([f"{drive}: {self.drive}", *self.notes, table, *measures_table(self.measured, "Hz")])
 
     def to_dict(self) -> dict[str, Any]:
         """The sweep as plain data, SI units."""
@@ -343,6 +355,7 @@ class PhasorSolution(Shown):
         return found | {
             "amplitude": self.amplitude, "source_phase_deg": math.degrees(self.phase), "drive": self.drive,
             "notes": list(self.notes), "warnings": list(self.warnings),
+            "measures": [{"name": name, **one._asdict()} for name, one in self.measured.items()],
         }  # fmt: skip
 
     def plot(self) -> Figure:

@@ -271,7 +271,7 @@ _FINEST = 1e-12  # Smallest tolerance of the interpolation error of a panel, rel
 _MOST_CUT = 4096  # Most halves of panels that are evaluated, in addition to four for each panel
 _MOST_SEARCHES = 60  # Most times that one panel is halved
 #: Gauss-Lobatto weights on [0, 1]: exact for polynomials of degree 23.
-_WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * POINTS[:NODES] - 1.0) ** 2)
+WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * POINTS[:NODES] - 1.0) ** 2)
 
 
 @dataclass(frozen=True)
@@ -321,7 +321,7 @@ class Stretch:
         # Gauss-Lobatto weights are exact up to twice the degree of the interpolant: if the terms of the series fall
         # geometrically, the quadrature error is about the interpolation error to the power 1.85, and 1.5 is safe.
         if float((share * error**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
-            return Weighed(t[:, :NODES], share[:, None] * _WEIGHTS, x[:, :NODES])
+            return Weighed(t[:, :NODES], share[:, None] * WEIGHTS, x[:, :NODES])
         return self._cut(name, _FINEST, panels)[0]
 
     def extremes(self, name: Named) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -366,7 +366,7 @@ class Stretch:
             most -= len(t)
         every, t, x = map(np.concatenate, zip(*parts, strict=True))
         share = every[:, 3] / every[:, 3].sum()
-        return Weighed(t, share[:, None] * _WEIGHTS, x), every.T
+        return Weighed(t, share[:, None] * WEIGHTS, x), every.T
 
 
 class Outputs(NamedTuple):

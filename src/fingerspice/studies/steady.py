@@ -23,6 +23,7 @@ from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.network import build_network, linear_scene, network_of, phasor_areas, with_skin_held
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.plots import drawing, traces
+from fingerspice.results.measures import Measured, Sweep, measured
 from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Figured, Sensitivity, Solution, Value
 from fingerspice.results.spectrum import PhasorSolution
@@ -141,14 +142,14 @@ def phasor(
         raise InputError("area='mean' needs the amplitude of the source's fundamental, and this source has none; "
                          "allowed: 'frozen' or an area in m^2")  # fmt: skip
     notes, warned = sweep_notes(circuit, f, "" if scene is None else scene.note, skin)
-    v, none = None, np.full(f.size, math.nan)
+    none = np.full(f.size, math.nan)
     with np.errstate(all="ignore"):
         areas = np.array([phasor_areas(network, area, float(x), amplitude) for x in f])
+        # As in ngspice, the AC of every source counts.
+        own = amplitude * np.exp(1j * phase)
+        s = np.array([own if alone else e.ac.phasor if e.ac is not None else 0.0 for e in network.sources], complex)
+        v = np.array([network.node_phasors(float(x), a, s) for x, a in zip(f, areas, strict=True)])
         if scene is None:
-            # Node voltages at the areas that the circuit gives; as in ngspice, the AC of every source counts.
-            own = amplitude * np.exp(1j * phase)
-            s = np.array([own if alone else e.ac.phasor if e.ac is not None else 0.0 for e in network.sources], complex)
-            v = np.array([network.node_phasors(float(x), areas[0], s) for x in f])
             layers, gain, u_gap, size, force = np.zeros((f.size, 0), complex), none + 0j, none + 0j, none, none
             results: tuple[NDArray[np.inexact], ...] = (v,)
         else:
@@ -167,10 +168,22 @@ def phasor(
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     names = () if scene is None else tuple(e.name for e in network.layers)
+    found = {} if frequency is None else _measured(circuit, f, {"area": area, "skin": skin, "finger": finger})
     return PhasorSolution(
         f, gain, layers, u_gap, size, force, amplitude, names, phase, drive, notes, warned, circuit, impedance,
-        network.node_names if scene is None else (), v,
+        network.node_names, v, found,
     )  # fmt: skip
+
+
+def _measured(circuit: Circuit, f: FloatArray, options: Mapping[str, Any]) -> dict[str, Measured]:
+    """The deck's `.meas ac` lines over a sweep (Hz)."""
+    bare = dataclasses.replace(circuit, measures=())
+
+    def solve(at: FloatArray) -> PhasorSolution:
+        with warnings.catch_warnings(action="ignore"):
+            return phasor(bare, at, **options)
+
+    return measured(Sweep(circuit, f, solve))
 
 
 @dataclass(frozen=True, repr=False)
