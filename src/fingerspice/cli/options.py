@@ -34,8 +34,8 @@ LONGEST_SOURCE = 1000  # Largest number of characters of a source's numbers that
 FOLDER = Path("out")  # Folder of the results unless another one is named
 #: First bytes of the tables that the commands write, and last ones of the heads of those about steps.
 _HEADS = (
-    b"t [s],u_source", b"frequency [Hz],gain [1],", b"frequency [Hz],v:", b"parameter,value [SI],unit,", b"time (s),drive (V)",
-    b"time (s),wanted force (N),",
+    b"t [s],u_source", b"frequency [Hz],gain [1],", b"frequency [Hz],v:", b"parameter,value [SI],unit,",
+    b"time (s),drive (V)", b"time (s),wanted force (N),",
 )  # fmt: skip
 _TAIL = b",status"
 SETS = ("set", "finger", "coating", "drive")  # Options that name sets of parameters
