@@ -12,7 +12,7 @@ import pytest
 import fingerspice as fs
 from analytic import impedance, table1_layers
 from fingerspice.base.errors import InputError
-from fingerspice.studies.fit import circuitfit
+from fingerspice.studies import fit as circuitfit
 from fingerspice.studies.fit.fitting import Fitted, followed
 from scenes import CIRCUITS, cases, covers, listed, shipped, table1, table1_deck
 
