@@ -401,33 +401,12 @@ def coupled_phasor(f: float, u0: float, params: Parameters = TABLE1, *, k: float
 # 4. Frozen area: exact linear responses (mpmath) -------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FrozenSine:
-    """Periodic response of the frozen circuit to U0 sin(2 pi f t + phase): `gains` complex (n_layers,)."""
-
-    f: float
-    u0: float
-    phase: float
-    gains: np.ndarray
-
-    def u(self, t: np.ndarray | float) -> np.ndarray:
-        """Layer voltages at times t in s, V, shape (len(t), n_layers)."""
-        wave = self.u0 * np.exp(1j * (2.0 * math.pi * self.f * np.atleast_1d(t) + self.phase))
-        return np.imag(wave[:, None] * self.gains)
-
-
 def periodic_sine_frozen(
-    f: float,
-    u0: float,
-    a: float,
-    params: Parameters = TABLE1,
-    *,
-    layers: Sequence[Layer] | None = None,
-    phase: float = 0.0,
-) -> FrozenSine:
-    """Periodic response to U0 sin(2 pi f t + phase) at frozen area a (m^2), by Eqs. 9 and 11."""
-    layers = tuple(layers) if layers is not None else table1_layers(f, params)
-    return FrozenSine(f, u0, phase, phasor_gains(f, a, layers))
+    f: float, u0: float, a: float, t: np.ndarray, layers: Sequence[Layer] | None = None, *, phase: float = 0.0
+) -> np.ndarray:
+    """Periodic layer voltages (len(t), n), V, under u0 sin(2 pi f t + phase) at frozen area a (m^2): Eqs. 9 and 11."""
+    gains = phasor_gains(f, a, table1_layers(f) if layers is None else layers)
+    return np.imag((u0 * np.exp(1j * (2.0 * math.pi * f * t + phase)))[:, None] * gains)
 
 
 DIGITS = 40
@@ -516,23 +495,6 @@ def piecewise_constant_frozen(
             k = min(max(bisect.bisect_right(edges, t) - 1, 0), len(lev) - 1)
             out.append(_as_float(circuit.advance(starts[k], mp.mpf(t) - ts[k])))
     return np.array(out)
-
-
-def square_frozen(
-    f: float,
-    u0: float,
-    a: float,
-    t_out: Sequence[float],
-    params: Parameters = TABLE1,
-    *,
-    layers: Sequence[Layer] | None = None,
-    duty: float = 0.5,
-) -> np.ndarray:
-    """Exact periodic layer voltages (len(t_out), n) under a square wave +-u0 at f Hz, +u0 on [0, duty/f)."""
-    layers = tuple(layers) if layers is not None else table1_layers(f, params)
-    period = 1.0 / f
-    wrapped = [t - period * math.floor(t / period) for t in t_out]
-    return piecewise_constant_frozen([0.0, duty * period, period], [u0, -u0], wrapped, a, layers, periodic=True)
 
 
 def sine_frozen_from_rest(
@@ -1405,39 +1367,21 @@ def transient(
     return Transient(*none, run.fold, tuple(run.zeros), stack, nodes, tuple(run.steps), u_before).at(t_out)
 
 
-def periodic_state(
-    segments: Sequence[Segment],
-    *,
-    law: str = "local",
-    params: Parameters = TABLE1,
-    freq: float | None = None,
-    layers: Sequence[Layer] | None = None,
-    gap: int = GAP,
-    area_mode: str | float = "coupled",
-    k: float = 1.0,
-    t_out: Sequence[float] = (),
-    **options: object,
-) -> Transient:
+def periodic_state(segments: Sequence[Segment], *, t_out: Sequence[float] = (), **options: object) -> Transient:
     """One period, that of `segments`, whose start reproduces its end (to about 1e-13 of the peak voltage).
 
-    Arguments are as in `transient`.
+    Options are as in `transient`.
     """
-    if layers is None:
-        if freq is None:
-            raise ValueError("freq (Hz) is required when layers are not given")
-        layers = table1_layers(freq, params)
-    common = dict(law=law, params=params, layers=layers, gap=gap, area_mode=area_mode, k=k, **options)
-    n = len(layers)
 
-    def end(u: np.ndarray) -> np.ndarray:
-        run = transient(segments, [], start=u, **common)
+    def end(u: str | np.ndarray) -> np.ndarray:
+        run = transient(segments, [], start=u, **options)
         if run.fold is not None:
             raise FoldError(run.fold.margin, run.fold.u_gap)
         return run.steps[-1].u_end
 
     # Two periods from the uncharged state, before the Newton iteration on the period map
-    u = end(end(np.zeros(n)))
-    scale = max(1e-300, float(np.max(np.abs(u))))
+    u = end(end("uncharged"))
+    n, scale = u.size, max(1e-300, float(np.max(np.abs(u))))
     basis = (np.eye(n) - 1.0 / n)[:, : n - 1]  # directions that keep the sum of the voltages
     base = end(u)
     size = 1e-5 * scale
@@ -1454,7 +1398,7 @@ def periodic_state(
         base = end(u)
     else:
         raise RuntimeError(f"period map did not converge: defect {worst} V")
-    return transient(segments, t_out, start=u, **common)
+    return transient(segments, t_out, start=u, **options)
 
 
 # 8. The same equations by DOP853, in two other forms: the check of section 7 ------------------------------------
@@ -1518,21 +1462,14 @@ def _dop_pieces(
     return out
 
 
-def dop853_voltage(
-    segments: Sequence[Segment],
-    t_out: Sequence[float],
-    *,
-    params: Parameters = TABLE1,
-    freq: float,
-    rtol: float = 1e-13,
-) -> np.ndarray:
+def dop853_voltage(segments: Sequence[Segment], t_out: Sequence[float], *, freq: float) -> np.ndarray:
     """`local` law in voltage form, C_x(A) u_x' = i - u_x/R_x with sum u_x' = U', by DOP853.
 
     i = (U' + sum u_x/(R_x C_x)) / sum 1/C_x. Arguments as in `transient`, but every segment needs its dU/dt
     and every output lies inside or on a segment edge (right-hand value). Returns (len(t_out), 3) layer
     voltages, V.
     """
-    layers = table1_layers(freq, params)
+    layers, rtol = table1_layers(freq), 1e-13
     c = np.array([x.c for x in layers])
     share = 1.0 / c / np.sum(1.0 / c)
 
@@ -1546,7 +1483,7 @@ def dop853_voltage(
         found[t0] = u
 
         def rhs(t: float, u: np.ndarray, s: float, slope: Waveform = slope) -> np.ndarray:
-            a = float(contact(s * u[GAP], params)[1])
+            a = float(contact(s * u[GAP])[1])
             leak = u * conductance(a)
             cap = c * a
             current = (float(slope(t)) + np.sum(leak / cap)) / np.sum(1.0 / cap)
@@ -1562,13 +1499,7 @@ def dop853_voltage(
 
 
 def dop853_leak(
-    segments: Sequence[Segment],
-    t_out: Sequence[float],
-    *,
-    params: Parameters = TABLE1,
-    freq: float,
-    law: str = "local",
-    rtol: float = 1e-13,
+    segments: Sequence[Segment], t_out: Sequence[float], *, freq: float, law: str = "local", rtol: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Leaked charge of either law by DOP853 from rest, in an absolute gauge; arguments as in `dop853_voltage`.
 
@@ -1576,19 +1507,19 @@ def dop853_leak(
     the gap voltage from the bracketed scalar equation. Returns the layer voltages, (len(t_out), 3) in V, and D in
     C/m^2 (`local`) or Q in C (`mobile`; here the charge through the terminals).
     """
-    layers = table1_layers(freq, params)
+    layers = table1_layers(freq)
     c = np.array([x.c for x in layers])
     elastance = float(np.sum(1.0 / c))
-    a_zero = float(area(0.0, params))
+    a_zero = float(area(0.0))
 
     def fields(source: float, w: np.ndarray, s: float | None) -> tuple[np.ndarray, float, float]:
         if law == "local":
             d = (source + float(np.sum(w / c))) / elastance
             u = (d - w) / c
-            return u, float(contact(abs(u[GAP]) if s is None else s * u[GAP], params)[1]), d
+            return u, float(contact(abs(u[GAP]) if s is None else s * u[GAP])[1]), d
         leaked = (float(np.sum(w / c)) / elastance - w[GAP]) / (c[GAP] * a_zero)
-        ua = mobile_gap_voltage(source / elastance / c[GAP], leaked, params, branch=s)
-        a = float(area(ua, params))
+        ua = mobile_gap_voltage(source / elastance / c[GAP], leaked, branch=s)
+        a = float(area(ua))
         q = (a * source + float(np.sum(w / c))) / elastance
         return (q - w) / (a * c), a, q
 

@@ -195,7 +195,7 @@ def test_frozen_sine_from_rest_settles_into_the_phasor_solution():
     t = np.array([0.0, 0.0013, 0.0987])
     exact = ref.sine_frozen_from_rest(100.0, 200.0, AREA_AT_REST, t, ref.table1_layers(100.0), phase=0.7)
     assert exact[0].sum() == pytest.approx(200.0 * math.sin(0.7), rel=1e-15)
-    steady = ref.periodic_sine_frozen(100.0, 200.0, AREA_AT_REST, phase=0.7).u(t)
+    steady = ref.periodic_sine_frozen(100.0, 200.0, AREA_AT_REST, t, phase=0.7)
     np.testing.assert_allclose(exact[-1], steady[-1], atol=1e-11)
     run = ref.transient(ref.sine_segments(200.0, 100.0, 0.1, phase=0.7), t, freq=100.0, area_mode="frozen")
     np.testing.assert_allclose(run.u, exact, atol=200 * 1e-14)
@@ -203,10 +203,11 @@ def test_frozen_sine_from_rest_settles_into_the_phasor_solution():
 
 def test_frozen_square_wave_is_the_same_by_exponentials_from_rest_and_by_collocation():
     t = np.linspace(0.0, 0.0099, 23)
-    exact = ref.square_frozen(100.0, 200.0, AREA_AT_REST, t)
+    layers, period = ref.table1_layers(100.0), [0.0, 0.005, 0.01]
+    exact = ref.piecewise_constant_frozen(period, [200.0, -200.0], t, AREA_AT_REST, layers, periodic=True)
     np.testing.assert_allclose(exact.sum(axis=1), np.where(t < 0.005, 200.0, -200.0), rtol=1e-14)
     edges, levels = [0.005 * j for j in range(31)], [200.0, -200.0] * 15
-    rest = ref.piecewise_constant_frozen(edges, levels, 0.14 + t, AREA_AT_REST, ref.table1_layers(100.0))
+    rest = ref.piecewise_constant_frozen(edges, levels, 0.14 + t, AREA_AT_REST, layers)
     np.testing.assert_allclose(rest, exact, atol=1e-6)  # slowest mode
     run = ref.periodic_state(ref.square_segments(200.0, 100.0, 1), freq=100.0, area_mode="frozen", t_out=t)
     np.testing.assert_allclose(run.u, exact, atol=200 * 2e-15 + 1e-13)
