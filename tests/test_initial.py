@@ -5,9 +5,9 @@ import pytest
 
 import analytic
 import fingerspice as fs
+from network_reference import deck_of, random_network
 from ngspice_tools import CIRCUITS, run_ngspice
 from scenes import LAWS, cases, deck, every_law, finger, listed, table1
-from start_reference import deck_of, random_network
 
 pytestmark = pytest.mark.filterwarnings("ignore:.* has no effect here")
 
