@@ -518,10 +518,10 @@ def sine_frozen_from_rest(
         return np.array([_as_float(steady(t) + circuit.advance(rest, t)) for t in t_out])
 
 
-# 5. Sources: segments (t0, t1, U, dU/dt), smooth on each closed segment --------------------------------------
+# 5. Sources: segments (t0, t1, U), smooth on each closed segment ---------------------------------------------
 
 Waveform = Callable[[np.ndarray], np.ndarray]
-Segment = tuple[float, float, Waveform, Waveform]
+Segment = tuple[float, float, Waveform]
 
 
 def _hold(level: float) -> Waveform:
@@ -530,19 +530,14 @@ def _hold(level: float) -> Waveform:
 
 def constant_segments(edges: Sequence[float], levels: Sequence[float]) -> list[Segment]:
     """Piecewise-constant source: levels[k] V on [edges[k], edges[k+1]) s."""
-    return [(edges[k], edges[k + 1], _hold(v), _hold(0.0)) for k, v in enumerate(levels)]
+    return [(edges[k], edges[k + 1], _hold(v)) for k, v in enumerate(levels)]
 
 
 def sine_segments(
     u0: float, f: float, t_end: float, *, phase: float = 0.0, offset: float = 0.0, t_start: float = 0.0
 ) -> list[Segment]:
     """One segment of offset + u0 sin(2 pi f t + phase), V; phase in rad, times in s."""
-    om = 2.0 * math.pi * f
-
-    def value(t: np.ndarray) -> np.ndarray:
-        return offset + u0 * np.sin(om * np.asarray(t) + phase)
-
-    return [(t_start, t_end, value, lambda t: u0 * om * np.cos(om * np.asarray(t) + phase))]
+    return [(t_start, t_end, lambda t: offset + u0 * np.sin(2.0 * math.pi * f * np.asarray(t) + phase))]
 
 
 def square_segments(u0: float, f: float, periods: int, *, duty: float = 0.5) -> list[Segment]:
@@ -557,14 +552,10 @@ def square_segments(u0: float, f: float, periods: int, *, duty: float = 0.5) -> 
 def pwl_segments(points: Sequence[tuple[float, float]]) -> list[Segment]:
     """Piecewise-linear source through (t in s, U in V); two equal times are an ideal jump."""
 
-    def ramp(t0: float, v0: float, slope: float) -> tuple[Waveform, Waveform]:
-        return (lambda t: v0 + slope * (np.asarray(t) - t0)), (lambda t: slope + 0.0 * np.asarray(t))
+    def ramp(t0: float, v0: float, slope: float) -> Waveform:
+        return lambda t: v0 + slope * (np.asarray(t) - t0)
 
-    out = []
-    for (t0, v0), (t1, v1) in pairwise(points):
-        if t1 > t0:
-            out.append((t0, t1, *ramp(t0, v0, (v1 - v0) / (t1 - t0))))
-    return out
+    return [(t0, t1, ramp(t0, v0, (v1 - v0) / (t1 - t0))) for (t0, v0), (t1, v1) in pairwise(points) if t1 > t0]
 
 
 # 6. The stack as an ODE in the leaked charges ----------------------------------------------------------------
@@ -1317,7 +1308,7 @@ def transient(
 ) -> Transient:
     """Transient of N layers in series under an ideal source, to about 1e-13 of the peak voltage.
 
-    `segments` are (t0, t1, U, ...) in order, without holes, U smooth on each and a function of arrays in s, or a
+    `segments` are (t0, t1, U) in order, without holes, U smooth on each and a function of arrays in s, or a
     number. The skin of the default stack is evaluated at `freq` (Hz); `layers` and `gap` are another stack and the
     index of its gap. `area_mode` is 'coupled' (A = g(|u_a|) at every instant), 'frozen' (A = g(0), friction included)
     or an area in m^2; `start` is 'uncharged' (all layers at 0 V; U(t0) then jumps in, split by 1/c_x), 'dc' (operating
@@ -1462,49 +1453,14 @@ def _dop_pieces(
     return out
 
 
-def dop853_voltage(segments: Sequence[Segment], t_out: Sequence[float], *, freq: float) -> np.ndarray:
-    """`local` law in voltage form, C_x(A) u_x' = i - u_x/R_x with sum u_x' = U', by DOP853.
-
-    i = (U' + sum u_x/(R_x C_x)) / sum 1/C_x. Arguments as in `transient`, but every segment needs its dU/dt
-    and every output lies inside or on a segment edge (right-hand value). Returns (len(t_out), 3) layer
-    voltages, V.
-    """
-    layers, rtol = table1_layers(freq), 1e-13
-    c = np.array([x.c for x in layers])
-    share = 1.0 / c / np.sum(1.0 / c)
-
-    def conductance(a: float) -> np.ndarray:
-        return np.array([1.0 / x.r_total + a / x.r_area for x in layers])
-
-    u = np.zeros(3)
-    found: dict[float, np.ndarray] = {}
-    for t0, t1, source, slope in segments:
-        u = u + share * (float(source(t0)) - u.sum())
-        found[t0] = u
-
-        def rhs(t: float, u: np.ndarray, s: float, slope: Waveform = slope) -> np.ndarray:
-            a = float(contact(s * u[GAP])[1])
-            leak = u * conductance(a)
-            cap = c * a
-            current = (float(slope(t)) + np.sum(leak / cap)) / np.sum(1.0 / cap)
-            return (current - leak) / cap
-
-        scale = max(abs(float(source(t))) for t in np.linspace(t0, t1, 33)) + float(np.max(np.abs(u)))
-        stops = [t for t in sorted(set(t_out)) if t0 < t < t1] + [t1]
-        atol = rtol * scale * np.ones(3)
-        states = _dop_pieces(rhs, lambda t, u, s: float(u[GAP]), t0, u, stops, rtol, atol, scale)
-        found.update(zip(stops, states, strict=True))
-        u = states[-1]
-    return np.array([found[t] for t in t_out])
-
-
 def dop853_leak(
     segments: Sequence[Segment], t_out: Sequence[float], *, freq: float, law: str = "local", rtol: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Leaked charge of either law by DOP853 from rest, in an absolute gauge; arguments as in `dop853_voltage`.
+    """Leaked charge of either law by DOP853 from rest, in an absolute gauge.
 
     `local`: lambda_x' = u_x/(R_x A), D = (U + sum lambda/c)/S. `mobile`: l_x' = u_x/R_x, Q = (A U + sum l/c)/S with
-    the gap voltage from the bracketed scalar equation. Returns the layer voltages, (len(t_out), 3) in V, and D in
+    the gap voltage from the bracketed scalar equation. Arguments as in `transient`, but every output lies inside a
+    segment or on its edge (right-hand value). Returns the layer voltages, (len(t_out), 3) in V, and D in
     C/m^2 (`local`) or Q in C (`mobile`; here the charge through the terminals).
     """
     layers = table1_layers(freq)
@@ -1524,7 +1480,7 @@ def dop853_leak(
         return (q - w) / (a * c), a, q
 
     w, found = np.zeros(3), {}
-    for t0, t1, source, *_ in segments:
+    for t0, t1, source in segments:
 
         def rhs(t: float, w: np.ndarray, s: float, source: Waveform = source) -> np.ndarray:
             u, a, _ = fields(float(source(t)), w, s)

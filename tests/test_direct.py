@@ -127,7 +127,7 @@ SCENES = {
         fs.Sine(80.0, 300.0) + fs.Square(40.0, 100.0),
         [
             (a, min(b, 0.012), lambda t, x=x: 80.0 * np.sin(600.0 * math.pi * np.asarray(t)) + x(t))
-            for a, b, x, _ in ref.square_segments(40.0, 100.0, 2)[:3]
+            for a, b, x in ref.square_segments(40.0, 100.0, 2)[:3]
         ],
         0.012,
     ),
