@@ -24,8 +24,8 @@ import numpy as np
 from playwright.sync_api import sync_playwright
 
 from baseline import revision
+from fingerspice.explorer import pages
 from fingerspice.explorer.scene import EXAMPLES
-from fingerspice.explorer.server import pages
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "explorer.json"

@@ -401,33 +401,12 @@ def coupled_phasor(f: float, u0: float, params: Parameters = TABLE1, *, k: float
 # 4. Frozen area: exact linear responses (mpmath) -------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FrozenSine:
-    """Periodic response of the frozen circuit to U0 sin(2 pi f t + phase): `gains` complex (n_layers,)."""
-
-    f: float
-    u0: float
-    phase: float
-    gains: np.ndarray
-
-    def u(self, t: np.ndarray | float) -> np.ndarray:
-        """Layer voltages at times t in s, V, shape (len(t), n_layers)."""
-        wave = self.u0 * np.exp(1j * (2.0 * math.pi * self.f * np.atleast_1d(t) + self.phase))
-        return np.imag(wave[:, None] * self.gains)
-
-
 def periodic_sine_frozen(
-    f: float,
-    u0: float,
-    a: float,
-    params: Parameters = TABLE1,
-    *,
-    layers: Sequence[Layer] | None = None,
-    phase: float = 0.0,
-) -> FrozenSine:
-    """Periodic response to U0 sin(2 pi f t + phase) at frozen area a (m^2), by Eqs. 9 and 11."""
-    layers = tuple(layers) if layers is not None else table1_layers(f, params)
-    return FrozenSine(f, u0, phase, phasor_gains(f, a, layers))
+    f: float, u0: float, a: float, t: np.ndarray, layers: Sequence[Layer] | None = None, *, phase: float = 0.0
+) -> np.ndarray:
+    """Periodic layer voltages (len(t), n), V, under u0 sin(2 pi f t + phase) at frozen area a (m^2): Eqs. 9 and 11."""
+    gains = phasor_gains(f, a, table1_layers(f) if layers is None else layers)
+    return np.imag((u0 * np.exp(1j * (2.0 * math.pi * f * t + phase)))[:, None] * gains)
 
 
 DIGITS = 40
@@ -518,23 +497,6 @@ def piecewise_constant_frozen(
     return np.array(out)
 
 
-def square_frozen(
-    f: float,
-    u0: float,
-    a: float,
-    t_out: Sequence[float],
-    params: Parameters = TABLE1,
-    *,
-    layers: Sequence[Layer] | None = None,
-    duty: float = 0.5,
-) -> np.ndarray:
-    """Exact periodic layer voltages (len(t_out), n) under a square wave +-u0 at f Hz, +u0 on [0, duty/f)."""
-    layers = tuple(layers) if layers is not None else table1_layers(f, params)
-    period = 1.0 / f
-    wrapped = [t - period * math.floor(t / period) for t in t_out]
-    return piecewise_constant_frozen([0.0, duty * period, period], [u0, -u0], wrapped, a, layers, periodic=True)
-
-
 def sine_frozen_from_rest(
     f: float, u0: float, a: float, t_out: Sequence[float], layers: Sequence[Layer], *, phase: float = 0.0
 ) -> np.ndarray:
@@ -556,10 +518,10 @@ def sine_frozen_from_rest(
         return np.array([_as_float(steady(t) + circuit.advance(rest, t)) for t in t_out])
 
 
-# 5. Sources: segments (t0, t1, U, dU/dt), smooth on each closed segment --------------------------------------
+# 5. Sources: segments (t0, t1, U), smooth on each closed segment ---------------------------------------------
 
 Waveform = Callable[[np.ndarray], np.ndarray]
-Segment = tuple[float, float, Waveform, Waveform]
+Segment = tuple[float, float, Waveform]
 
 
 def _hold(level: float) -> Waveform:
@@ -568,19 +530,14 @@ def _hold(level: float) -> Waveform:
 
 def constant_segments(edges: Sequence[float], levels: Sequence[float]) -> list[Segment]:
     """Piecewise-constant source: levels[k] V on [edges[k], edges[k+1]) s."""
-    return [(edges[k], edges[k + 1], _hold(v), _hold(0.0)) for k, v in enumerate(levels)]
+    return [(edges[k], edges[k + 1], _hold(v)) for k, v in enumerate(levels)]
 
 
 def sine_segments(
     u0: float, f: float, t_end: float, *, phase: float = 0.0, offset: float = 0.0, t_start: float = 0.0
 ) -> list[Segment]:
     """One segment of offset + u0 sin(2 pi f t + phase), V; phase in rad, times in s."""
-    om = 2.0 * math.pi * f
-
-    def value(t: np.ndarray) -> np.ndarray:
-        return offset + u0 * np.sin(om * np.asarray(t) + phase)
-
-    return [(t_start, t_end, value, lambda t: u0 * om * np.cos(om * np.asarray(t) + phase))]
+    return [(t_start, t_end, lambda t: offset + u0 * np.sin(2.0 * math.pi * f * np.asarray(t) + phase))]
 
 
 def square_segments(u0: float, f: float, periods: int, *, duty: float = 0.5) -> list[Segment]:
@@ -595,14 +552,10 @@ def square_segments(u0: float, f: float, periods: int, *, duty: float = 0.5) -> 
 def pwl_segments(points: Sequence[tuple[float, float]]) -> list[Segment]:
     """Piecewise-linear source through (t in s, U in V); two equal times are an ideal jump."""
 
-    def ramp(t0: float, v0: float, slope: float) -> tuple[Waveform, Waveform]:
-        return (lambda t: v0 + slope * (np.asarray(t) - t0)), (lambda t: slope + 0.0 * np.asarray(t))
+    def ramp(t0: float, v0: float, slope: float) -> Waveform:
+        return lambda t: v0 + slope * (np.asarray(t) - t0)
 
-    out = []
-    for (t0, v0), (t1, v1) in pairwise(points):
-        if t1 > t0:
-            out.append((t0, t1, *ramp(t0, v0, (v1 - v0) / (t1 - t0))))
-    return out
+    return [(t0, t1, ramp(t0, v0, (v1 - v0) / (t1 - t0))) for (t0, v0), (t1, v1) in pairwise(points) if t1 > t0]
 
 
 # 6. The stack as an ODE in the leaked charges ----------------------------------------------------------------
@@ -1355,7 +1308,7 @@ def transient(
 ) -> Transient:
     """Transient of N layers in series under an ideal source, to about 1e-13 of the peak voltage.
 
-    `segments` are (t0, t1, U, ...) in order, without holes, U smooth on each and a function of arrays in s, or a
+    `segments` are (t0, t1, U) in order, without holes, U smooth on each and a function of arrays in s, or a
     number. The skin of the default stack is evaluated at `freq` (Hz); `layers` and `gap` are another stack and the
     index of its gap. `area_mode` is 'coupled' (A = g(|u_a|) at every instant), 'frozen' (A = g(0), friction included)
     or an area in m^2; `start` is 'uncharged' (all layers at 0 V; U(t0) then jumps in, split by 1/c_x), 'dc' (operating
@@ -1405,39 +1358,21 @@ def transient(
     return Transient(*none, run.fold, tuple(run.zeros), stack, nodes, tuple(run.steps), u_before).at(t_out)
 
 
-def periodic_state(
-    segments: Sequence[Segment],
-    *,
-    law: str = "local",
-    params: Parameters = TABLE1,
-    freq: float | None = None,
-    layers: Sequence[Layer] | None = None,
-    gap: int = GAP,
-    area_mode: str | float = "coupled",
-    k: float = 1.0,
-    t_out: Sequence[float] = (),
-    **options: object,
-) -> Transient:
+def periodic_state(segments: Sequence[Segment], *, t_out: Sequence[float] = (), **options: object) -> Transient:
     """One period, that of `segments`, whose start reproduces its end (to about 1e-13 of the peak voltage).
 
-    Arguments are as in `transient`.
+    Options are as in `transient`.
     """
-    if layers is None:
-        if freq is None:
-            raise ValueError("freq (Hz) is required when layers are not given")
-        layers = table1_layers(freq, params)
-    common = dict(law=law, params=params, layers=layers, gap=gap, area_mode=area_mode, k=k, **options)
-    n = len(layers)
 
-    def end(u: np.ndarray) -> np.ndarray:
-        run = transient(segments, [], start=u, **common)
+    def end(u: str | np.ndarray) -> np.ndarray:
+        run = transient(segments, [], start=u, **options)
         if run.fold is not None:
             raise FoldError(run.fold.margin, run.fold.u_gap)
         return run.steps[-1].u_end
 
     # Two periods from the uncharged state, before the Newton iteration on the period map
-    u = end(end(np.zeros(n)))
-    scale = max(1e-300, float(np.max(np.abs(u))))
+    u = end(end("uncharged"))
+    n, scale = u.size, max(1e-300, float(np.max(np.abs(u))))
     basis = (np.eye(n) - 1.0 / n)[:, : n - 1]  # directions that keep the sum of the voltages
     base = end(u)
     size = 1e-5 * scale
@@ -1454,7 +1389,7 @@ def periodic_state(
         base = end(u)
     else:
         raise RuntimeError(f"period map did not converge: defect {worst} V")
-    return transient(segments, t_out, start=u, **common)
+    return transient(segments, t_out, start=u, **options)
 
 
 # 8. The same equations by DOP853, in two other forms: the check of section 7 ------------------------------------
@@ -1518,82 +1453,34 @@ def _dop_pieces(
     return out
 
 
-def dop853_voltage(
-    segments: Sequence[Segment],
-    t_out: Sequence[float],
-    *,
-    params: Parameters = TABLE1,
-    freq: float,
-    rtol: float = 1e-13,
-) -> np.ndarray:
-    """`local` law in voltage form, C_x(A) u_x' = i - u_x/R_x with sum u_x' = U', by DOP853.
-
-    i = (U' + sum u_x/(R_x C_x)) / sum 1/C_x. Arguments as in `transient`, but every segment needs its dU/dt
-    and every output lies inside or on a segment edge (right-hand value). Returns (len(t_out), 3) layer
-    voltages, V.
-    """
-    layers = table1_layers(freq, params)
-    c = np.array([x.c for x in layers])
-    share = 1.0 / c / np.sum(1.0 / c)
-
-    def conductance(a: float) -> np.ndarray:
-        return np.array([1.0 / x.r_total + a / x.r_area for x in layers])
-
-    u = np.zeros(3)
-    found: dict[float, np.ndarray] = {}
-    for t0, t1, source, slope in segments:
-        u = u + share * (float(source(t0)) - u.sum())
-        found[t0] = u
-
-        def rhs(t: float, u: np.ndarray, s: float, slope: Waveform = slope) -> np.ndarray:
-            a = float(contact(s * u[GAP], params)[1])
-            leak = u * conductance(a)
-            cap = c * a
-            current = (float(slope(t)) + np.sum(leak / cap)) / np.sum(1.0 / cap)
-            return (current - leak) / cap
-
-        scale = max(abs(float(source(t))) for t in np.linspace(t0, t1, 33)) + float(np.max(np.abs(u)))
-        stops = [t for t in sorted(set(t_out)) if t0 < t < t1] + [t1]
-        atol = rtol * scale * np.ones(3)
-        states = _dop_pieces(rhs, lambda t, u, s: float(u[GAP]), t0, u, stops, rtol, atol, scale)
-        found.update(zip(stops, states, strict=True))
-        u = states[-1]
-    return np.array([found[t] for t in t_out])
-
-
 def dop853_leak(
-    segments: Sequence[Segment],
-    t_out: Sequence[float],
-    *,
-    params: Parameters = TABLE1,
-    freq: float,
-    law: str = "local",
-    rtol: float = 1e-13,
+    segments: Sequence[Segment], t_out: Sequence[float], *, freq: float, law: str = "local", rtol: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Leaked charge of either law by DOP853 from rest, in an absolute gauge; arguments as in `dop853_voltage`.
+    """Leaked charge of either law by DOP853 from rest, in an absolute gauge.
 
     `local`: lambda_x' = u_x/(R_x A), D = (U + sum lambda/c)/S. `mobile`: l_x' = u_x/R_x, Q = (A U + sum l/c)/S with
-    the gap voltage from the bracketed scalar equation. Returns the layer voltages, (len(t_out), 3) in V, and D in
+    the gap voltage from the bracketed scalar equation. Arguments as in `transient`, but every output lies inside a
+    segment or on its edge (right-hand value). Returns the layer voltages, (len(t_out), 3) in V, and D in
     C/m^2 (`local`) or Q in C (`mobile`; here the charge through the terminals).
     """
-    layers = table1_layers(freq, params)
+    layers = table1_layers(freq)
     c = np.array([x.c for x in layers])
     elastance = float(np.sum(1.0 / c))
-    a_zero = float(area(0.0, params))
+    a_zero = float(area(0.0))
 
     def fields(source: float, w: np.ndarray, s: float | None) -> tuple[np.ndarray, float, float]:
         if law == "local":
             d = (source + float(np.sum(w / c))) / elastance
             u = (d - w) / c
-            return u, float(contact(abs(u[GAP]) if s is None else s * u[GAP], params)[1]), d
+            return u, float(contact(abs(u[GAP]) if s is None else s * u[GAP])[1]), d
         leaked = (float(np.sum(w / c)) / elastance - w[GAP]) / (c[GAP] * a_zero)
-        ua = mobile_gap_voltage(source / elastance / c[GAP], leaked, params, branch=s)
-        a = float(area(ua, params))
+        ua = mobile_gap_voltage(source / elastance / c[GAP], leaked, branch=s)
+        a = float(area(ua))
         q = (a * source + float(np.sum(w / c))) / elastance
         return (q - w) / (a * c), a, q
 
     w, found = np.zeros(3), {}
-    for t0, t1, source, *_ in segments:
+    for t0, t1, source in segments:
 
         def rhs(t: float, w: np.ndarray, s: float, source: Waveform = source) -> np.ndarray:
             u, a, _ = fields(float(source(t)), w, s)

@@ -1,21 +1,22 @@
-"""Independent solutions of networks: nodal equations by dense matrix exponentials, fingers by a hand-written ODE.
+"""Independent solutions of networks: linear ones by dense linear algebra in node voltages, fingers by an own ODE.
 
 It never imports the package.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
+from scipy.linalg import expm, null_space
 
 import analytic
 
 FloatArray = NDArray[np.float64]
+Branch = tuple[int, int, float]
 
 
 @dataclass(frozen=True)
@@ -23,86 +24,207 @@ class Tone:
     """offset + amplitude sin(2 pi frequency t), from t = 0 on; 0 before."""
 
     offset: float
-    amplitude: float
-    frequency: float
+    amplitude: float = 0.0
+    frequency: float = 1.0
 
     def __call__(self, t: float) -> float:
         return self.offset + self.amplitude * np.sin(2.0 * np.pi * self.frequency * t)
 
+    def __str__(self) -> str:
+        """As a netlist has it."""
+        return f"SIN({self.offset!r} {self.amplitude!r} {self.frequency!r})" if self.amplitude else f"{self.offset!r}"
+
+
+@dataclass(frozen=True)
+class Capacitor:
+    """Between two nodes, farad, and its ``IC=`` in V or None."""
+
+    p: int
+    n: int
+    value: float
+    initial: float | None = None
+
 
 @dataclass(frozen=True)
 class Nodal:
-    """A network of R and C with grounded voltage sources and current sources into nodes. Node 0 is ground.
+    """A network of R, C, V and I between nodes 0 (ground) to `nodes`, and how it starts.
 
-    Elements are (node, node, value); `voltages` and `currents` map a node to its source.
+    Resistors and sources are (node, node, value or tone); `initial` is ``.ic``. The start minimises a list of quadratic
+    forms one after the other, each over the states that the minima of the earlier forms leave free.
     """
 
     nodes: int
-    resistors: Sequence[tuple[int, int, float]]
-    capacitors: Sequence[tuple[int, int, float]]
-    voltages: dict[int, Tone]
-    currents: dict[int, Tone]
+    resistors: Sequence[Branch]
+    capacitors: Sequence[Capacitor]
+    voltages: Sequence[tuple[int, int, Tone]]
+    currents: Sequence[tuple[int, int, Tone]]
+    initial: dict[int, float] = field(default_factory=dict)
+    uic: bool = True
 
-    def _matrix(self, branches: Sequence[tuple[int, int, float]]) -> FloatArray:
-        m = np.zeros((self.nodes, self.nodes))
-        for a, b, value in branches:
-            for i, j in ((a, b), (b, a)):
-                if i:
-                    m[i - 1, i - 1] += value
-                    if j:
-                        m[i - 1, j - 1] -= value
-        return m
+    def _across(self, pairs: Sequence[tuple[int, int]]) -> FloatArray:
+        """Voltages between pairs of nodes from those of the nodes, shape (n_pair, nodes)."""
+        every = np.vstack([np.zeros(self.nodes), np.eye(self.nodes)])
+        return np.array([every[a] - every[b] for a, b in pairs]).reshape(len(pairs), self.nodes)
+
+    @property
+    def _tied(self) -> FloatArray:
+        """What voltage sources tie, shape (n_voltage, nodes)."""
+        return self._across([(p, n) for p, n, _ in self.voltages])
+
+    @property
+    def _brought(self) -> FloatArray:
+        """The nodes that current sources bring their currents into, shape (nodes, n_current)."""
+        # A current source takes from its first node.
+        return -self._across([(p, n) for p, n, _ in self.currents]).T
+
+    @property
+    def _stored(self) -> tuple[FloatArray, FloatArray]:
+        """Capacitances between nodes, and the charges on the nodes at the start with ``uic``."""
+        across = self._across([(c.p, c.n) for c in self.capacitors])
+        at = {0: 0.0, **{node: self.initial.get(node, 0.0) for node in range(1, self.nodes + 1)}}
+        held = np.array([at[c.p] - at[c.n] if c.initial is None else c.initial for c in self.capacitors])
+        farad = np.array([c.value for c in self.capacitors])
+        return across.T @ (farad[:, None] * across), across.T @ (farad * held)
+
+    @property
+    def _siemens(self) -> FloatArray:
+        """Conductances between nodes."""
+        across = self._across([(p, n) for p, n, _ in self.resistors])
+        return across.T @ (np.array([1.0 / r for *_, r in self.resistors])[:, None] * across)
+
+    def start(self) -> FloatArray:
+        """Node voltages (nodes,) at 0+."""
+        volts, amperes = (np.array([tone(0.0) for *_, tone in of]) for of in (self.voltages, self.currents))
+        tied, resisted = _squares(self._tied, volts), (self._siemens, self._brought @ amperes)
+        if self.uic:
+            return _in_turn([tied, self._stored, resisted])
+        named = _squares(self._across([(node, 0) for node in self.initial]), np.array(list(self.initial.values())))
+        rest = _in_turn([tied, named, resisted])
+        # Let go, the capacitors hold what they have.
+        farad, _ = self._stored
+        return _in_turn([tied, (farad, farad @ rest), resisted])
 
     def response(self, times: Sequence[float]) -> FloatArray:
-        """Node voltages (n_t, nodes) at t > 0 from the uncharged state, by one dense exponential per time."""
-        c = self._matrix(self.capacitors)
-        g = self._matrix([(a, b, 1.0 / r) for a, b, r in self.resistors])
-        known = [n - 1 for n in sorted(self.voltages)]
-        unknown = [i for i in range(self.nodes) if i not in known]
+        """Node voltages (n_t, nodes), by one dense exponential per time."""
+        tied, (farad, _), siemens = self._tied, self._stored, self._siemens
         # An exosystem: for every source the states 1, sin, cos.
-        sources = [(n - 1, self.voltages[n]) for n in sorted(self.voltages)] + [
-            (n - 1, self.currents[n]) for n in sorted(self.currents)
-        ]
-        size = 3 * len(sources)
-        turn = np.zeros((size, size))
-        value = np.zeros((len(sources), size))
-        start = np.zeros(size)
-        for j, (_, tone) in enumerate(sources):
+        tones = [tone for *_, tone in (*self.voltages, *self.currents)]
+        size, count = 3 * len(tones), len(self.voltages)
+        turn, value, begin = np.zeros((size, size)), np.zeros((len(tones), size)), np.tile([1.0, 0.0, 1.0], len(tones))
+        for j, tone in enumerate(tones):
             omega = 2.0 * np.pi * tone.frequency
             turn[3 * j + 1, 3 * j + 2], turn[3 * j + 2, 3 * j + 1] = omega, -omega
-            value[j, 3 * j], value[j, 3 * j + 1] = tone.offset, tone.amplitude
-            start[3 * j], start[3 * j + 2] = 1.0, 1.0
-        held = value[: len(known)]
-        push = np.zeros((self.nodes, size))
-        for j, (node, _) in enumerate(sources[len(known) :]):
-            push[node] += value[len(known) + j]
-
-        def part(m: FloatArray, rows: list[int], columns: list[int]) -> FloatArray:
-            return m[np.ix_(rows, columns)]
-
-        # Of the unknown voltages some combinations charge no capacitor: those follow at once.
-        every_c, every_g = part(c, unknown, unknown), part(g, unknown, unknown)
-        values, vectors = np.linalg.eigh(every_c)
-        stored = values > 1e-9 * values.max(initial=0.0)
-        live, free = vectors[:, stored], vectors[:, ~stored]
-        force = push[unknown] - part(g, unknown, known) @ held
-        inverse = np.linalg.inv(free.T @ every_g @ free)
-        from_live = live - free @ inverse @ (free.T @ every_g @ live)
-        from_sources = free @ inverse @ (free.T @ force)
-        inverse_c = np.linalg.inv(live.T @ every_c @ live)
-        into = live.T @ (force - every_g @ from_sources - part(c, unknown, known) @ held @ turn)
+            value[j, 3 * j : 3 * j + 2] = tone.offset, tone.amplitude
+        # Voltages that obey the sources, and what is free beside them.
+        held = np.linalg.pinv(tied) @ value[:count]
+        free = null_space(tied) if len(tied) else np.eye(self.nodes)
+        values, vectors = np.linalg.eigh(free.T @ farad @ free)
+        stores = values > 1e-9 * values.max(initial=1e-30)
+        live, idle = free @ vectors[:, stores], free @ vectors[:, ~stores]
+        # The idle part charges no capacitor and follows at once: its nodes' currents add up to nothing.
+        push = self._brought @ value[count:] - siemens @ held
+        follow = np.linalg.inv(idle.T @ siemens @ idle) @ idle.T
+        move, along = live - idle @ follow @ siemens @ live, held + idle @ follow @ push
+        inverse = np.linalg.inv(live.T @ farad @ live) @ live.T
         n = live.shape[1]
         whole = np.zeros((n + size, n + size))
-        whole[:n, :n], whole[:n, n:] = -inverse_c @ (live.T @ every_g @ from_live), inverse_c @ into
-        whole[n:, n:] = turn
-        # The step of the voltage sources at t = 0 splits over the capacitors at once.
-        first = -inverse_c @ (live.T @ (part(c, unknown, known) @ (held @ start)))
-        out = np.zeros((len(times), self.nodes))
-        for i, t in enumerate(times):
-            z = expm(whole * t) @ np.concatenate([first, start])
-            out[i, unknown] = from_live @ z[:n] + from_sources @ z[n:]
-            out[i, known] = held @ z[n:]
-        return out
+        whole[:n, :n], whole[n:, n:] = -inverse @ siemens @ move, turn
+        whole[:n, n:] = inverse @ (push - siemens @ idle @ follow @ push - farad @ held @ turn)
+        first = np.concatenate([inverse @ farad @ (self.start() - held @ begin), begin])
+        return np.array([np.hstack([move, along]) @ (expm(whole * t) @ first) for t in times])
+
+
+def _squares(across: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return across.T @ across, across.T @ value
+
+
+def _in_turn(levels: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """The x that makes x^T H x / 2 - h^T x least for the first (H, h), and of those for the next, and so on.
+
+    Raises
+    ------
+    ValueError
+        Where they leave a choice.
+    """
+    x = np.zeros(levels[0][0].shape[0])
+    free = np.eye(x.size)
+    for h, linear in levels:
+        if not free.shape[1]:
+            break
+        values, vectors = np.linalg.eigh(free.T @ h @ free)
+        taken = values > 1e-10 * max(float(np.abs(h).max(initial=0.0)), 1e-30)
+        along = free @ vectors[:, taken]
+        x = x + along @ ((along.T @ (linear - h @ x)) / values[taken])
+        free = free @ vectors[:, ~taken]
+    if free.shape[1]:
+        raise ValueError("a node has no voltage")
+    return x
+
+
+def random_network(seed: int) -> Nodal:
+    """A network of 2 to 6 nodes with random ``IC=`` and ``.ic``, with ``uic`` or not; the sources constant."""
+    rng = np.random.default_rng(seed)
+    while True:
+        found = _draw(rng)
+        try:
+            found.start()
+        except ValueError:
+            continue
+        return found
+
+
+def _draw(rng: np.random.Generator) -> Nodal:
+    count = int(rng.integers(2, 7))
+
+    def volts() -> float:
+        return round(float(rng.uniform(-50.0, 50.0)), 3)
+
+    def pair() -> tuple[int, int]:
+        a, b = rng.choice(count + 1, 2, replace=False)
+        return int(a), int(b)
+
+    def farads() -> float:
+        return float(f"{1e-10 * 10.0 ** rng.uniform(0.0, 2.0):.4g}")
+
+    uic = bool(rng.random() < 0.6)
+    capacitors = [
+        Capacitor(*pair(), farads(), volts() if rng.random() < 0.5 else None) for _ in range(rng.integers(2, 9))
+    ]
+    resistors = [(*pair(), float(f"{1e3 * 10.0 ** rng.uniform(0.0, 2.0):.4g}")) for _ in range(rng.integers(0, 5))]
+    tree = list(range(count + 1))
+    voltages = []
+    for a, b in (pair() for _ in range(rng.integers(1, 3))):
+        if tree[a] != tree[b]:
+            voltages.append((a, b, Tone(volts())))
+            tree = [tree[b] if x == tree[a] else x for x in tree]
+    currents = [(*pair(), Tone(1e-4 * volts())) for _ in range(rng.integers(0, 2))]
+    initial = {node: volts() for node in range(1, count + 1) if rng.random() < 0.5}
+    # The last node has two to ground, the others as many as they need to have two ends: what hangs on capacitors only
+    # holds its charge.
+    for node in (*range(1, count + 1), count):
+        ends = [n for branch in (*resistors, *voltages, *currents) for n in branch[:2]]
+        ends += [n for c in capacitors for n in (c.p, c.n)]
+        wanted = 2 - ends.count(node) if node < count else 1
+        for _ in range(max(wanted, int(rng.random() < 0.6))):
+            resistors.append((node, 0, float(f"{1e5 * 10.0 ** rng.uniform(0.0, 2.0):.4g}")))
+    return Nodal(count, resistors, capacitors, voltages, currents, initial, uic)
+
+
+def deck_of(network: Nodal, step: float, stop: float, extra: Sequence[str] = ()) -> str:
+    """The network as text, nodes called n1, n2, ..."""
+
+    def named(letter: str, i: int, p: int, n: int) -> str:
+        return f"{letter}{i} n{p} n{n}"
+
+    lines = [f"{named('R', i, p, n)} {r!r}" for i, (p, n, r) in enumerate(network.resistors)]
+    for i, c in enumerate(network.capacitors):
+        held = "" if c.initial is None else f" IC={c.initial!r}"
+        lines.append(f"{named('C', i, c.p, c.n)} {c.value!r}{held}")
+    for letter, sources in (("V", network.voltages), ("I", network.currents)):
+        lines += [f"{named(letter, i, p, n)} {tone}" for i, (p, n, tone) in enumerate(sources)]
+    lines += [f".ic v(n{node})={v!r}" for node, v in network.initial.items()]
+    lines += [*extra, f".tran {step!r} {stop!r}{' uic' if network.uic else ''}"]
+    return "\n".join(("a random network", *lines, "")).replace(" n0 ", " 0 ")
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along. Contact laws raised them
 # by 1,243 where 1,200 were given; SPICE's directives have used 1,984 of 2,500.
-ALL_LINES = 37_541
-ALL_FILES = 135
+ALL_LINES = 37_537
+ALL_FILES = 131
 PACKAGE_LINES = {
-    "base": 1_028, "circuit": 2_411, "cli": 1_588, "engine": 7_182, "explorer": 1_168, "netlist": 2_601,
-    "numerics": 1_170, "physics": 807, "plots": 1_285, "results": 3_244, "sets": 361, "solve": 5_368,
-    "studies": 6_558, "torch": 375, "waveforms": 2_239,
+    "base": 1_028, "circuit": 2_411, "cli": 1_588, "engine": 7_182, "explorer": 1_167, "netlist": 2_601,
+    "numerics": 1_170, "physics": 807, "plots": 1_285, "results": 3_244, "sets": 361, "solve": 5_367,
+    "studies": 6_556, "torch": 375, "waveforms": 2_239,
 }  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.
@@ -39,8 +39,8 @@ MANY_PARAMETERS = {
     "solve.simulation.simulate",
     "solve.simulation.plan",
     "studies.batch.batch.batch",
-    "studies.fit.circuitfit.fit",
-    "studies.sweep.populations.sweep",
+    "studies.fit.fit",
+    "studies.sweep.sweep",
     "studies.steady.steady_state",
     "solve.streaming.stream",
     "torch.Simulator.__init__",
@@ -64,9 +64,9 @@ STRANGERS = (
 LENT = {
     "circuit.circuit.Circuit._replaced": "netlist.netlist",
     "circuit.circuit.Circuit.draw": "plots.schematic",
-    "circuit.circuit.Circuit.explore": "explorer.server",
+    "circuit.circuit.Circuit.explore": "explorer",
     "results.solution.Solution.plot": "plots.traces",
-    "results.solution.Solution.explore": "explorer.server",
+    "results.solution.Solution.explore": "explorer",
     "results.solution.Solution.sample_gradient": "solve.derivatives",
     "results.spectrum.Spectrum.plot": "plots.traces",
     "results.spectrum.PhasorSolution.plot": "plots.traces",

@@ -37,16 +37,7 @@ def test_a_wide_population_meets_what_was_asked_and_states_its_error(circuit: Ci
         assert found.attrs["n_ordinary"] == 0
 
 
-ONCE_WRONG = {
-    # 72 and 144 steps of this scene agree to 1e-8, and were 8e-6 off.
-    "a mean that half the steps have by chance": {
-        "Vdrive.phase_deg": 90.0, "Xgap.r": 593044.5139771261, "Xcoat.r": 27741.739304862655,
-        "Xgap.fn": 1.7854234663825923,
-    },
-    "a leaking gap that leads a sine from 0 V": {
-        "Xgap.r": 26850.0, "Xcoat.r": 420900.0, "Xgap.fn": 0.1793, "Xgap.d": 3.59e-6, "Vdrive.amplitude": 184.5,
-    },
-}  # fmt: skip
+ONCE_WRONG = dict(listed("batches_once_wrong"))
 
 
 @pytest.mark.parametrize("changes", ONCE_WRONG.values(), ids=ONCE_WRONG)
@@ -256,21 +247,9 @@ def test_a_scene_past_its_fold_fails_by_itself() -> None:
     assert found.f_el_mean[0] == pytest.approx(run.f_el_mean, rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("circuit", "parameters", "outputs", "why"),
-    [
-        (table1(library="fingerspice_mobile.lib"), {"Xgap.d": [3e-6]}, ("f_el_mean",), "mobile"),
-        (table1(source="SIN(10 200 100)"), {"Xgap.d": [3e-6]}, ("f_el_mean",), "plain sine"),
-        (table1(), {"Xgap.d": [3e-6]}, ("u_gap_peak",), "u_gap_peak"),
-        (table1(), {"Xgap.m_exp": [0.5]}, ("f_el_mean",), "xgap.m_exp"),
-        (table1(), {"Vdrive.offset": [5.0]}, ("f_el_mean",), "vdrive.offset"),
-        (table1(), {"Xgap.fn": [1e-4]}, ("f_el_mean",), "does not"),
-        (table1(tran="10u 23m uic"), {"Xgap.d": [3e-6]}, ("f_el_mean",), "half periods"),
-        (table1(gap={"a_fix": 30}), {"Xgap.d": [3e-6]}, ("f_el_mean",), "no contact"),
-        (table1(extra="Rload drive 0 1k\nCload top 0 1p"), {"Xgap.d": [3e-6]}, ("f_el_mean",), "no series stack"),
-    ],
-)
-def test_what_lockstep_cannot_do_goes_one_by_one(circuit, parameters, outputs, why):
+@pytest.mark.parametrize(("changes", "parameters", "outputs", "why"), listed("one_by_one"))
+def test_what_lockstep_cannot_do_goes_one_by_one(changes, parameters, outputs, why):
+    circuit = table1(**changes)
     found = fs.batch(circuit, parameters, outputs=outputs, rtol=1e-6)
     assert found.attrs["n_ordinary"] == 1
     assert why in found.attrs["ordinary"]

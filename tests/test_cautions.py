@@ -213,13 +213,7 @@ def test_no_source_of_a_shipped_deck_misses_its_run() -> None:
         assert list(course_warnings(circuit, 0.0, circuit.tran.stop, by_deck=True)) == []  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize(("times", "said"), [
-    ([0.0, 20.0, 40.0], "; its times are probably in ms, and count as s here"),
-    ([0.0, 4e4], "; its times are probably in ms or us, and count as s here"),
-    ([1.76e9, 1.76e9 + 1.0], "; its times are probably a clock's: subtract the first of them"),
-    ([0.0, 0.06], "; a run to 0.06 s contains it"),
-    ([-1.0, 0.01], "t_stop = 0.04 s"),
-])  # fmt: skip
+@pytest.mark.parametrize(("times", "said"), listed("output_times"))
 def test_output_times_outside_the_run_are_refused_with_the_likely_slip(times: list[float], said: str) -> None:
     with pytest.raises(fs.InputError, match=r"times from 0 s to t_stop = 0\.04 s") as refused:
         fs.simulate(table1(), t_stop=0.04, t_eval=times)

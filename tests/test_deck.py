@@ -257,11 +257,7 @@ def test_fifty_random_nests_are_what_ngspice_takes_or_refused(tmp_path: Path) ->
     assert all(re.search("allowed: another name|in a circle", refusal) for refusal in refusals), refusals
 
 
-@pytest.mark.parametrize(("call", "said"), [
-    ("R0 a 0 1\n.subckt s a b w=4 v=1\nR1 a b {v}\n.ends\nX1 a 0 s w=9 v={w}", "w = 7 .* s's own w = 9"),
-    ("R0 a 0 1\n.subckt s a b w=4 v=1\nR1 a b {v}\n.ends\nX1 a 0 s v={w}", "w = 7 .* s's own w = 4"),
-    ("X1 a 0 area SLAB d=4u eps_r=3 rho={d*1e15}", "d = 2e-06 .* SLAB's own d = 4e-06"),
-])  # fmt: skip
+@pytest.mark.parametrize(("call", "said"), listed("captured"))
 def test_a_value_whose_name_ngspice_takes_inside_is_refused(call: str, said: str) -> None:
     with pytest.raises(InputError, match=f"{said}; allowed: another name for one of them"):
         parse_deck(f"captured\n.param w=7 d=2u\n{call}\n.end\n")
@@ -286,21 +282,7 @@ def test_functions_have_the_values_of_ngspice(tmp_path: Path, body: str, expecte
         assert theirs(body, tmp_path) == pytest.approx(expected, rel=1e-6)
 
 
-@pytest.mark.parametrize(("lines", "message", "place"), [
-    ((".func a(x) {b(x)}", ".func b(x) {a(x)}"), "functions refer to each other in a circle: a -> b -> a", (2, 13)),
-    ((".func a(x) {a(x-1)}",), "functions refer to each other in a circle: a -> a", (2, 13)),
-    ((".func sin(x) {x}",), "function 'sin' is built in; allowed: another name", (2, 7)),
-    ((".func q(x,x) {x}",), "an argument of q is 'x'; allowed: names, each once", (2, 6)),
-    ((".func q(1) {2}",), "an argument of q is '1'", (2, 6)),
-    ((".func q {x}",), "write .func name(x, y) {x*y}", (2, 6)),
-    ((".func q(x) {x*+}",), "a value is missing at the end", (2, 17)),
-    ((".func q(x) {x}", ".func Q(y) {y}"), "function 'q' is defined twice", (3, 1)),
-    ((".func q(x) {x}", "R1 a 0 {q(1, 2)}"), "q takes 1 argument, 2 given", (3, 9)),
-    ((".func par(x) {x}", "R1 a 0 {parr(1)}"), "'parr' is not a function; did you mean 'par'?", (3, 9)),
-    ((".func q(x) {x*zz}", "R1 a 0 {q(1)}"), "in q of <netlist>:2:13: parameter 'zz' is not defined", (3, 9)),
-    ((".global",), "write .global node node ...", (2, 1)),
-    ((".endl",), ".endl without its .lib: a section is read by .lib FILE SECTION", (2, 1)),
-])  # fmt: skip
+@pytest.mark.parametrize(("lines", "message", "place"), listed("functions"))
 def test_functions_and_shared_nodes_that_mean_nothing_are_refused(
     lines: tuple[str, ...], message: str, place: tuple[int, int]
 ) -> None:
@@ -372,15 +354,7 @@ def test_local_files_are_included_and_named_in_places(tmp_path: Path) -> None:
     assert caught.value.where == Where(str(tmp_path / "my parts.lib"), 3, 8)
 
 
-@pytest.mark.parametrize(("name", "message"), [
-    ("../secret.lib", "outside the netlist's folder"), ("/etc/passwd", "outside the netlist's folder"),
-    ("link.lib", "outside the netlist's folder"), ("missing.lib", "does not exist"),
-    ("part.lob", "did you mean 'part.lib'"), ("./part.lob", "'./part.lob' does not exist; did you mean 'part.lib'"),
-    ("sub/inner.lob", "did you mean 'sub/inner.lib'"), ("sbu/inner.lib", "did you mean 'sub/inner.lib'"),
-    ("missing/part.lib", "did you mean 'part.lib'"), ("sub/fingerspce.lib", "did you mean 'fingerspice.lib'"),
-    ("main.cir", "includes itself"), ("loop.lib", "includes itself"), ("sub", "is a folder"),
-    ("end.lib", "not an included file, has .end"), ("x" * 5000, "cannot be read|not a usable"),
-])  # fmt: skip
+@pytest.mark.parametrize(("name", "message"), [*listed("other_files"), ("x" * 5000, "cannot be read|not a usable")])
 def test_other_files_are_refused_by_name(tmp_path: Path, name: str, message: str) -> None:
     folder = tmp_path / "deck"
     (folder / "sub").mkdir(parents=True)

@@ -52,7 +52,7 @@ def test_a_sine_from_rest_is_its_phasor_and_what_decays(f: float, phase: float, 
 def test_a_sine_settles_at_equation_11(f: float, first: int) -> None:
     t = (first + np.linspace(0.0, 1.0, 41)) / f
     solution = linear(f"SIN(0 200 {f!r})", t, (first + 1.0) / f, f)
-    expected = ref.periodic_sine_frozen(f, 200.0, AREA).u(within_a_period(t, f))
+    expected = ref.periodic_sine_frozen(f, 200.0, AREA, within_a_period(t, f))
     rounded_phase = float(2.0 * math.pi * np.spacing(f * t.max()))
     assert np.abs(solution.u_layer - expected).max() <= (1e-12 + rounded_phase) * 200.0
 
@@ -127,7 +127,7 @@ SCENES = {
         fs.Sine(80.0, 300.0) + fs.Square(40.0, 100.0),
         [
             (a, min(b, 0.012), lambda t, x=x: 80.0 * np.sin(600.0 * math.pi * np.asarray(t)) + x(t))
-            for a, b, x, _ in ref.square_segments(40.0, 100.0, 2)[:3]
+            for a, b, x in ref.square_segments(40.0, 100.0, 2)[:3]
         ],
         0.012,
     ),
@@ -353,7 +353,7 @@ def test_any_number_of_layers_from_rest_and_in_the_periodic_state(layers: int, l
     assert np.abs(run.u_layer - ref.sine_frozen_from_rest(500.0, 10.0, 40e-6, t, stack)).max() <= 1e-9 * 10.0
     state = fs.steady_state(circuit, charge_law=law, rtol=1e-11)
     assert state.multipliers.shape == (layers - 1,)
-    want = ref.periodic_sine_frozen(500.0, 10.0, 40e-6, layers=stack).u(state.solution.t)
+    want = ref.periodic_sine_frozen(500.0, 10.0, 40e-6, state.solution.t, stack)
     assert np.abs(state.solution.u_layer - want).max() <= 1e-11 * 10.0
 
 

@@ -4,6 +4,7 @@ import math
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,15 +78,10 @@ def test_no_parasitics_are_no_elements(key: str) -> None:
     assert len(circuit.elements) == 4
 
 
-@pytest.mark.parametrize(("line", "tran", "noted"), [
-    (".tran 20m", Tran(2e-6, 0.02), True), (".tran 20m uic", Tran(2e-6, 0.02, uic=True), True),
-    (".tran 0 20m", Tran(2e-6, 0.02), True), (".tran 0 20m 5m", Tran(2e-6, 0.02, 0.005), True),
-    (".tran 0 20m 0 10u", Tran(1e-5, 0.02, 0.0, 1e-5), False),
-    (".tran 0 20m 5m 10u uic", Tran(1e-5, 0.02, 0.005, 1e-5, True), False),
-])  # fmt: skip
-def test_ltspices_tran_needs_no_step(line: str, tran: Tran, noted: bool) -> None:
+@pytest.mark.parametrize(("line", "tran", "noted"), listed("trans_of_ltspice"))
+def test_ltspices_tran_needs_no_step(line: str, tran: dict[str, Any], noted: bool) -> None:
     circuit, said = read((TRAN, line))
-    assert circuit.tran == tran
+    assert circuit.tran == Tran(**tran)
     expected = f"deck.cir:7:1: '{line}' has no TSTEP, which LTspice does not need: 10,000 outputs, one every 2e-06 s"
     assert said == ([expected] if noted else [])
 

@@ -29,9 +29,9 @@ import fingerspice as fs
 from commands import Command
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.devices import DEVICES
+from fingerspice.explorer import MOST_BYTES, Explorer, pages
 from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS, WAVEFORMS
 from fingerspice.explorer.scene import EXAMPLES, as_deck, as_python, scene
-from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from scenes import DECKS, cases, listed
 
 ROOT = Path(__file__).parents[1]

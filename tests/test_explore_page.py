@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
+from fingerspice.explorer import static_page
 from fingerspice.explorer.scene import EXAMPLES
-from fingerspice.explorer.server import static_page
 from scenes import CIRCUITS
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")

@@ -12,9 +12,9 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
+from fingerspice.explorer import framed
 from fingerspice.explorer.request import asked_by, read_source, text_of
 from fingerspice.explorer.scene import EXAMPLES, applied, as_python, before, scene
-from fingerspice.explorer.server import framed
 from test_explore import baked, run_as_python
 
 DECKS = {example["name"]: example["request"]["deck"] for example in EXAMPLES}

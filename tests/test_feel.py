@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import fingerspice as fs
 from commands import Command
 from fingerspice import studies
 from fingerspice.studies.feel import FINGERPAD, GRAVITY, SkinMechanics, Threshold, android_threshold, feel
-from scenes import deck, table1
+from scenes import deck, listed, table1
 
 ROOT = Path(__file__).parents[1]
 EPS0, D, MU, LOAD = 8.854e-12, 3.5e-6, 0.3, 0.5
@@ -188,19 +189,10 @@ def test_bands_add_up_to_the_variance_of_noise() -> None:
     assert 0.5 * np.sum(found.force**2) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize(("make", "said"), [
-    (lambda: SkinMechanics("x", -1.0, 1.0, 1.0), "mass is -1.0 kg; allowed: finite, 0 or more kg"),
-    (lambda: SkinMechanics("x", 1.0, 1.0, 0.0), "more than 0 N/m"),
-    (lambda: SkinMechanics("x", 1.0, math.nan, 1.0), "damping is nan"),
-    (lambda: Threshold("x", (1.0,), (0.0,)), "two rows of equal length"),
-    (lambda: Threshold("x", (1.0, 2.0), (0.0, 1.0, 2.0)), "two rows of equal length"),
-    (lambda: Threshold("x", (2.0, 1.0), (0.0, 0.0)), "point 2 is 1.0 Hz"),
-    (lambda: Threshold("x", (1.0, 2.0), (math.nan, 0.0)), "point 1 is 1.0 Hz, nan dB"),
-    (lambda: Threshold("x", (1.0, 2.0), (0.0, 0.0), reference=0.0), "reference is 0 m/s.*> 0"),
-])  # fmt: skip
-def test_mechanics_and_thresholds_without_sense_are_refused(make: object, said: str) -> None:
+@pytest.mark.parametrize(("kind", "given", "named", "said"), listed("feelings"))
+def test_mechanics_and_thresholds_without_sense_are_refused(kind: str, given: list[Any], named: Any, said: str) -> None:
     with pytest.raises(fs.InputError, match=said):
-        make()  # type: ignore[operator]
+        getattr(studies.feel, kind)(*given, **named)
 
 
 def test_what_cannot_be_felt_is_refused(frozen: fs.Solution) -> None:

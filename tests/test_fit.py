@@ -12,7 +12,7 @@ import pytest
 import fingerspice as fs
 from analytic import impedance, table1_layers
 from fingerspice.base.errors import InputError
-from fingerspice.studies.fit import circuitfit
+from fingerspice.studies import fit as circuitfit
 from fingerspice.studies.fit.fitting import Fitted, followed
 from scenes import CIRCUITS, cases, covers, listed, shipped, table1, table1_deck
 
@@ -398,14 +398,7 @@ def test_a_skin_that_suits_every_source_is_not_told(circuit, tmp_path, recwarn):
     assert len([one for one in told if "takes its data" in str(one.message)]) == 1
 
 
-@pytest.mark.parametrize(
-    ("column", "factor", "row", "said"),
-    [
-        ("f_el_mean", 1e3, 0, "largest f_el_mean is .*newton, not millinewton; was .*m"),
-        ("Vdrive.amplitude", 1e-3, 5, r"largest Vdrive\.amplitude is 200 mV, .*volt, not kilovolt; was 200 meant"),
-        ("source.frequency", 1e-9, 5, "Vdrive frequency is 500 nHz, outside"),
-    ],
-)
+@pytest.mark.parametrize(("column", "factor", "row", "said"), listed("data_in_another_unit"))
 def test_data_in_another_unit_are_told_and_end_in_a_bounded_number_of_evaluations(
     circuit, data, column, factor, row, said
 ):
@@ -475,15 +468,7 @@ def test_laws_are_compared_by_akaikes_criterion_or_said_not_to_be_told_apart() -
     assert close.to_dict()["best"] == close.best
 
 
-@pytest.mark.parametrize(
-    ("laws", "count", "said"),
-    [
-        ({"dmt": ["Xgap.alpha"]}, 7, "1 laws are given; allowed: two or more"),
-        ({"dmt": ["Xgap.alpha"], "dmd": ["Xgap.alpha"]}, 7, "contact law is 'dmd'"),
-        ({"dmt": ["Xgap.slope"], "jkr": ["Xgap.alpha"]}, 7, "Xgap.slope"),
-        ({"dmt": ["Xgap.alpha"], "jkr": ["Xgap.alpha"]}, 3, "3 data are too few to judge .* with 2 numbers to find"),
-    ],
-)
+@pytest.mark.parametrize(("laws", "count", "said"), listed("comparisons_of_laws"))
 def test_wrong_comparisons_of_laws_are_refused(laws: dict[str, list[str]], count: int, said: str) -> None:
     data = {"Vdrive.amplitude": np.linspace(20.0, 100.0, count), "area_mean": np.linspace(35.0, 35.2, count) * 1e-6}
     with pytest.raises(fs.InputError, match=said):

@@ -313,16 +313,7 @@ def test_impedances_are_drawn_as_bode_and_nyquist() -> None:
         fs.large_signal(table1(), [100.0], [20.0])[0].plot_impedance()
 
 
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        ("Xq a 0 CPE q=1n n_cpe=0", "Xq n_cpe is 0; allowed: more than 0, from 1e-06 to 0.999999"),
-        ("Xq a 0 CPE q=1n n_cpe=1", "Xq n_cpe is 1; allowed: more than 0, from 1e-06 to 0.999999"),
-        ("Xq a 0 CPE q=0 n_cpe=0.5", "Xq q is 0 S s.n; allowed: more than 0"),
-        ("Xq a 0 CPE q=1n", "Xq: CPE needs n_cpe, missing here"),
-        ("Xq a 0 area CPE q=1n n_cpe=0.5", r"Xq: CPE has 2 nodes \(p n\), 3 given"),
-    ],
-)
+@pytest.mark.parametrize(("line", "said"), listed("constant_phase"))
 def test_a_constant_phase_elements_range_is_told_at_its_call(line: str, said: str) -> None:
     with pytest.raises(fs.InputError, match=rf"<netlist>:3:\d+: {said}"):
         deck("V1 a 0 1", line)

@@ -13,7 +13,7 @@ import pytest
 
 import fingerspice as fs
 from ngspice_tools import call_ngspice
-from scenes import deck, finger, table1
+from scenes import deck, finger, listed, table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 W = 200.0 * math.pi
@@ -77,14 +77,7 @@ def of_ngspice(text: str) -> dict[str, float]:
 
 
 #: Forms that both simulators take, each with the size to which its error is relative.
-FORMS = {
-    "MAX V(top)": 200.0, "MIN V(top)": 200.0, "PP V(skin)": 200.0, "AVG V(top)": 200.0,
-    "RMS V(top)": 200.0, "INTEG V(top) FROM=1m TO=7m": 1.0, "FIND V(skin) AT=12.3m": 200.0,
-    "WHEN V(top)=50 RISE=2": 1e-2, "WHEN V(top)=25 CROSS=LAST": 1e-2, "WHEN V(top)=-30 FALL=1": 1e-2,
-    "FIND V(skin) WHEN V(top)=50 CROSS=3": 200.0, "WHEN V(top)=V(skin) CROSS=LAST": 1e-2,
-    "TRIG V(drive) VAL=100 RISE=1 TARG V(top) VAL=50 RISE=1": 1e-2, "TRIG AT=5m TARG V(top) VAL=0 FALL=LAST": 1e-2,
-    "RMS par('V(top)*V(top)')": 4e4, "AVG par('V(top)-V(skin)')": 200.0,
-}  # fmt: skip
+FORMS = dict(listed("measures_of_ngspice"))
 TOP = ("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "foot", f=100.0), "Rfoot foot 0 10k")
 PULSED = ("Vdrive drive 0 PULSE(0 150 1m 0.5m 0.5m 3m 10m)", *TOP[1:])
 SLOW = (
@@ -162,36 +155,13 @@ def test_measures_are_printed_and_in_json_files_and_loaded_runs(tmp_path: Path, 
     assert json.loads(run.to_xarray().attrs["measures"])["top"] == run.measures["top"]
 
 
-WRONG = {
-    "tran x": ".meas ends where what is measured is missing", "tran": ".meas ends where the measure's name",
-    "tran x SUM V(a)": ".meas x 'sum'; allowed: AVG RMS MIN MAX PP", "trn x MAX V(a)": ".meas 'trn'; allowed: TRAN",
-    "tran x MAX V(bb)": r".meas V\(bb\): the circuit has no node 'bb'; did you mean 'b'",
-    "tran x MAX I(R3)": r".meas I\(R3\): the circuit has no element 'r3'",
-    "tran x MAX Q(R1)": r".meas Q\(R1\) is no vector", "tran x MAX 3": "where a vector belongs",
-    "tran x MAX F_EL(R1)": r".meas F_EL\(R1\): the circuit has no GAP 'r1'",
-    "tran x MAX {V(a)+v0}": "'v0' is not defined", "tran x MAX {V(a)+}": "a value is missing",
-    "tran x WHEN V(a)=1 RISE=0": "counts RISE=0; allowed: 1, 2", "tran x WHEN V(a)=1 RISE=1.5": "counts RISE=1.5",
-    "tran x TRIG V(a) VAL=1": ".meas ends where TARG is missing",
-    "tran x AVG V(a) FROM=1m ABOUT=2m": "'about' is not understood",
-    "tran x FIND V(a) AT=soon": "'soon' where the value of AT belongs", "tran x PARAM='y+1'": "'y' is not defined",
-    "tran x WHEN V(a)": r"no value that V\(a\) crosses", "tran x WHEN V(a)=1 RISE=1 FALL=2": "has RISE and FALL",
-    "tran x PARAM=": "PARAM has no expression", "tran m0 MAX V(a)": ".meas m0 is given twice",
-}  # fmt: skip
-WITHOUT = {
-    "FIND V(b) AT=60m": "0.06 s is outside the run", "MAX {1/(V(b)-V(b))}": "has no value: float division by zero",
-    "AVG V(b) FROM=40m TO=60m": "is not within the run from 0 to 0.05 s",
-    "AVG V(b) FROM=30m TO=20m": "its window from 0.03 to 0.02 s is empty",
-    "WHEN V(b)=0.2 RISE=9": "has 5 of 0.2 where RISE=9", "PARAM='sqrt(0-m0)'": "its expression has no value",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("line", "said"), WRONG.items())
+@pytest.mark.parametrize(("line", "said"), listed("wrong_measures"))
 def test_wrong_measures_are_refused_with_their_place(line: str, said: str) -> None:
     with pytest.raises(fs.InputError, match=rf"<netlist>:\d+:\d+: .*{said}"):
         measured(".meas tran m0 MAX V(b)", f".meas {line}")
 
 
-@pytest.mark.parametrize(("line", "said"), WITHOUT.items())
+@pytest.mark.parametrize(("line", "said"), listed("measures_without_a_value"))
 def test_a_measure_without_a_value_says_why_and_the_others_stand(line: str, said: str) -> None:
     found = measured(
         ".meas tran m0 MAX V(b)", f".meas tran m1 {line}", ".meas tran m2 PP V(b)", ".meas noise m3 MAX V(b)"

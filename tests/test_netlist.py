@@ -87,17 +87,9 @@ def test_subcircuits_with_parameters_give_the_circuit_of_the_flat_deck() -> None
     assert nested.replace({"Xf.Xgap.d": 5e-6})["Xf.Xgap"].values["d"] == 5e-6
 
 
-TRAN = {
-    ".tran 10u 50m": Tran(1e-5, 0.05),
-    ".tran 10u 50m uic": Tran(1e-5, 0.05, uic=True),
-    ".tran 10us 50ms 5m": Tran(1e-5, 0.05, 0.005),
-    ".tran 10u 50m 0 1u UIC": Tran(1e-5, 0.05, 0.0, 1e-6, True),
-    ".tran {1/1e5} '5*10m'": Tran(1e-5, 0.05),
-}
-
-
 def test_tran_has_spices_four_numbers_and_uic() -> None:
-    assert {line: read((".tran 10u 50m uic", line)).tran for line in TRAN} == TRAN
+    for line, expected in listed("trans"):
+        assert read((".tran 10u 50m uic", line)).tran == Tran(**expected)
 
 
 def test_ac_asks_for_a_sweep() -> None:

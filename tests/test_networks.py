@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import analytic
 import fingerspice as fs
-from network_reference import Floating, Nodal, Tone
+from network_reference import Capacitor, Floating, Nodal, Tone, deck_of
 from scenes import COAT, GAP, assignments, by_turns, cases, deck, every_law, finger, floating, shipped
 
 # Linear networks ---------------------------------------------------------------------------------------------
@@ -36,19 +36,11 @@ def networks(draw: st.DrawFn) -> Nodal:
     tone = st.builds(Tone, st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.sampled_from((1e3, 7e4)))
     driven, pushed, current = draw(st.integers(1, count)), draw(st.integers(1, count)), draw(tone)
     scaled = Tone(1e-4 * current.offset, 1e-4 * current.amplitude, current.frequency)
-    voltages, currents = {driven: draw(tone)}, {pushed: scaled} if draw(st.booleans()) else {}
+    voltages, currents = [(driven, 0, draw(tone))], [(0, pushed, scaled)] if draw(st.booleans()) else []
     # A node that one element alone touches dangles: a large resistor changes nothing there.
-    ends = [n for branch in (*resistors, *capacitors) for n in branch[:2]] + [*voltages, *currents]
+    ends = [n for branch in (*resistors, *capacitors, *voltages, *currents) for n in branch[:2]]
     resistors += [(n, 0, 1e9) for n in range(1, count + 1) if ends.count(n) == 1]
-    return Nodal(count, resistors, capacitors, voltages, currents)
-
-
-def circuit_of(network: Nodal) -> fs.Circuit:
-    lines = [f"R{i} n{a} n{b} {r!r}" for i, (a, b, r) in enumerate(network.resistors)]
-    lines += [f"C{i} n{a} n{b} {c!r}" for i, (a, b, c) in enumerate(network.capacitors)]
-    for kind, sources in (("V{0} n{0} 0", network.voltages), ("I{0} 0 n{0}", network.currents)):
-        lines += [f"{kind.format(n)} SIN({s.offset!r} {s.amplitude!r} {s.frequency!r})" for n, s in sources.items()]
-    return deck(*(line.replace(" n0", " 0") for line in lines))
+    return Nodal(count, resistors, [Capacitor(*branch) for branch in capacitors], voltages, currents)
 
 
 @settings(max_examples=cases(60, 30), deadline=None, derandomize=True)
@@ -56,7 +48,7 @@ def circuit_of(network: Nodal) -> fs.Circuit:
 def test_random_networks_equal_a_dense_exponential_of_the_nodal_equations(network: Nodal) -> None:
     times = np.array([1e-8, 3e-7, 1e-5, 1.3e-4, 2e-3])
     expected = network.response(times)
-    s = fs.simulate(circuit_of(network), t_stop=2e-3, t_eval=times)
+    s = fs.simulate(fs.parse_netlist(deck_of(network, 1e-6, 2e-3)), t_eval=times)
     assert s.plan.tier == "linear"
     got = np.column_stack([s.node_voltages[f"n{i}"] for i in range(1, network.nodes + 1)])
     assert np.abs(got - expected).max() <= 1e-10 * max(1.0, np.abs(expected).max())
@@ -65,9 +57,9 @@ def test_random_networks_equal_a_dense_exponential_of_the_nodal_equations(networ
 @settings(max_examples=10, deadline=None, derandomize=True, phases=[Phase.generate])
 @given(networks())
 def test_the_stepped_tier_agrees_with_the_closed_form(network: Nodal) -> None:
-    circuit = circuit_of(network)
-    exact = fs.simulate(circuit, t_stop=1e-3)
-    stepped = fs.simulate(circuit, t_stop=1e-3, tier="coupled", rtol=1e-8, throw=False)
+    circuit = fs.parse_netlist(deck_of(network, 1e-6, 1e-3))
+    exact = fs.simulate(circuit)
+    stepped = fs.simulate(circuit, tier="coupled", rtol=1e-8, throw=False)
     if not stepped.success:
         # Nothing to scale the error by: the capacitors hold nothing.
         assert stepped.status is fs.Status.ERROR_NOT_MET

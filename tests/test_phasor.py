@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -225,18 +226,9 @@ def test_a_circuit_without_a_gap_says_where_its_skins_data_are_held_and_takes_no
         fs.phasor(deck("V1 in 0 5", "R1 in out 1k", "C1 out 0 1u"), 100.0)
 
 
-@pytest.mark.parametrize(
-    ("sweep", "expected"),
-    [
-        (AcSweep("lin", 5, 10.0, 50.0), [10.0, 20.0, 30.0, 40.0, 50.0]),
-        (AcSweep("dec", 1, 10.0, 1e4), [10.0, 100.0, 1e3, 1e4]),
-        (AcSweep("oct", 1, 10.0, 80.0), [10.0, 20.0, 40.0, 80.0]),
-        (AcSweep("dec", 2, 10.0, 200.0), [10.0, 10.0**1.5, 100.0, 200.0]),
-        (AcSweep("dec", 3, 100.0, 100.0), [100.0]),
-    ],
-)
-def test_the_frequencies_of_an_ac_line_run_from_start_to_stop(sweep: AcSweep, expected: list[float]) -> None:
-    np.testing.assert_allclose(sweep_frequencies(sweep), expected, rtol=1e-12)
+@pytest.mark.parametrize(("sweep", "expected"), listed("ac_lines"))
+def test_the_frequencies_of_an_ac_line_run_from_start_to_stop(sweep: list[Any], expected: list[float]) -> None:
+    np.testing.assert_allclose(sweep_frequencies(AcSweep(*sweep)), expected, rtol=1e-12)
 
 
 def test_the_source_sees_the_layers_in_series_and_what_stands_beside_them():

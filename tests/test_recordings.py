@@ -9,7 +9,7 @@ import pytest
 import analytic
 import fingerspice as fs
 import recording_errors
-from fingerspice.solve.recordings import run as lanes_of_a_run
+from fingerspice.solve import recordings as lanes_of_a_run
 from fingerspice.waveforms.samples import as_samples
 from scenes import cases, every_law, table1, table1_deck
 

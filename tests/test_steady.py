@@ -223,7 +223,7 @@ def test_a_frozen_circuit_has_the_multipliers_of_its_rates(f: float, law: str) -
     np.testing.assert_allclose(np.sort(state.multipliers)[::-1], np.exp(-rates / f), rtol=0, atol=1e-8)
     assert state.stability_margin == pytest.approx(-math.expm1(-rates[0] / f), rel=1e-7)
     phase = state.solution.t - state.solution.t[0]
-    want = ref.periodic_sine_frozen(f, 200.0, AREA).u(phase)
+    want = ref.periodic_sine_frozen(f, 200.0, AREA, phase)
     assert np.abs(state.solution.u_layer - want).max() <= 1e-12 * 200.0
 
 

@@ -24,8 +24,8 @@ from scipy import stats
 
 import fingerspice as fs
 from commands import tree
-from fingerspice.studies.sweep import chunks, populations
-from fingerspice.studies.sweep.populations import Plan
+from fingerspice.studies import sweep as populations
+from fingerspice.studies.sweep import Plan, chunks
 from processes import forked, no_room_here
 from scenes import CIRCUITS, DECKS, cases, listed, shipped
 

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from fingerspice.base.errors import InputError as InputError
     from fingerspice.circuit.circuit import Circuit as Circuit
     from fingerspice.circuit.laws import ContactLaw as ContactLaw
-    from fingerspice.explorer.server import Explorer as Explorer
-    from fingerspice.explorer.server import explore as explore
+    from fingerspice.explorer import Explorer as Explorer
+    from fingerspice.explorer import explore as explore
     from fingerspice.netlist.netlist import parse_netlist as parse_netlist
     from fingerspice.netlist.netlist import read_netlist as read_netlist
     from fingerspice.results.outcome import Plan as Plan
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
-    from fingerspice.studies.fit.circuitfit import Fit as Fit
-    from fingerspice.studies.fit.circuitfit import fit as fit
+    from fingerspice.studies.fit import Fit as Fit
+    from fingerspice.studies.fit import fit as fit
     from fingerspice.studies.fit.contactfit import ContactFit as ContactFit
     from fingerspice.studies.fit.contactfit import compare_laws as compare_laws
     from fingerspice.studies.fit.contactfit import fit_contact as fit_contact
@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.steady import steady_state as steady_state
     from fingerspice.studies.steps import operating_points as operating_points
     from fingerspice.studies.steps import run_steps as run_steps
-    from fingerspice.studies.sweep.populations import sobol as sobol
-    from fingerspice.studies.sweep.populations import sweep as sweep
+    from fingerspice.studies.sweep import sobol as sobol
+    from fingerspice.studies.sweep import sweep as sweep
     from fingerspice.waveforms.periodic import PWL as PWL
     from fingerspice.waveforms.periodic import Burst as Burst
     from fingerspice.waveforms.periodic import Pulse as Pulse

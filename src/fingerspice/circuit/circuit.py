@@ -260,7 +260,7 @@ class Circuit(Remembering, Shown):
         Explorer
             The running page.
         """
-        from fingerspice.explorer.server import explore
+        from fingerspice.explorer import explore
 
         return explore(self)
 

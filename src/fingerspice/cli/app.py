@@ -312,7 +312,7 @@ def explore(
     job.deck = deck or job.deck
     circuit = None if deck is None else job.read()
     if static is not None:
-        from fingerspice.explorer.server import static_page
+        from fingerspice.explorer import static_page
 
         check_output(static, deck)
         _give_file(job, static, static_page(circuit))

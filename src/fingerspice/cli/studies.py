@@ -251,7 +251,7 @@ def sweep(
       fingerspice sweep circuits/population.toml
     """
     from fingerspice.plots.picture import plot_sweep
-    from fingerspice.studies.sweep import populations
+    from fingerspice.studies import sweep as populations
 
     asked, job.deck = _read(file)
     job.name = job.name or file.stem
@@ -300,7 +300,7 @@ def sweep(
 
 def _told(answer: dict[str, Any], found: Any) -> str:
     """Fill the answer with the percentiles of a whole sweep, which this text has."""
-    from fingerspice.studies.sweep.populations import summary
+    from fingerspice.studies.sweep import summary
 
     rows = summary(found)
     answer.update(figures=rows, failed=int((found.status >= 2).sum()))

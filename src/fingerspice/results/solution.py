@@ -536,7 +536,7 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured, Measuring):
 
     def explore(self) -> Any:
         """Show the circuit as it was run on a local page, as `fs.explore` does, whose `Explorer` it gives."""
-        from fingerspice.explorer.server import explore
+        from fingerspice.explorer import explore
 
         return explore(self)
 

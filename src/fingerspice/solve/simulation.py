@@ -28,7 +28,7 @@ from fingerspice.solve.derivatives import check_request, sensitivities_of
 from fingerspice.solve.nodal import FOREIGN, solve_coupled, solve_foreign
 from fingerspice.solve.periodic import asked
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare, shortest_event
-from fingerspice.solve.recordings.run import solve as solve_recording
+from fingerspice.solve.recordings import solve as solve_recording
 from fingerspice.solve.runs import ROUGH, Progress, Run, excess_of, run_failure, run_warnings
 from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.waveform import DOUBLE, refuse, require

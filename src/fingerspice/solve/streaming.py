@@ -1,6 +1,6 @@
 """Streams: long runs chunk by chunk, in constant memory.
 
-A run is integrated in pieces whose length does not depend on the chunks: one that `solve.recordings.run` follows in the
+A run is integrated in pieces whose length does not depend on the chunks: one that `solve.recordings` follows in the
 pieces that it takes, any other run in windows of a fixed number of outputs, each starting from the final state of the
 window before. Chunks are cut from the outputs of the pieces, so that no bit depends on their length.
 """
@@ -23,7 +23,7 @@ from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.periodic import asked
 from fingerspice.solve.problem import Problem, at_breakpoints, check_length, check_outputs
-from fingerspice.solve.recordings.run import LaneMarch, LostError, prepared
+from fingerspice.solve.recordings import LaneMarch, LostError, prepared
 from fingerspice.solve.runs import Run
 from fingerspice.solve.simulation import check_arguments, integrated, make_plan, own_rtol, solution_of, state_error
 from fingerspice.solve.starting import as_shown

@@ -21,7 +21,7 @@ from fingerspice.circuit.devices import DEVICES
 from fingerspice.circuit.laws import ContactLaw
 from fingerspice.circuit.statespace import build_stack, contact_of, loop_of
 from fingerspice.physics.contact import JkrContact, ridge_area
-from fingerspice.studies.fit.circuitfit import Fit, fit
+from fingerspice.studies.fit import Fit, fit
 from fingerspice.studies.fit.fitting import NOT_FOUND, SIGMA, FitResult, Fitted, Given, Problem, followed, measured_of
 from fingerspice.waveforms.waveform import refuse, require
 

@@ -36,7 +36,7 @@ from fingerspice.circuit.describe import digests, scenes_warnings
 from fingerspice.results.runfile import CHECKSUM, Array, attributes_of, create, tidy
 from fingerspice.studies.batch.batch import MESSAGES, STATUS_NAMES, batch, checked_scenes
 from fingerspice.studies.batch.lockstep import LOCKSTEP
-from fingerspice.studies.sweep.populations import Plan
+from fingerspice.studies.sweep import Plan
 from fingerspice.waveforms.waveform import refuse, require
 
 if TYPE_CHECKING:
