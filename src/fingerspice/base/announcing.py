@@ -103,10 +103,10 @@ class Compiling:
                 self._bar.stop()
                 self._bar = None
 
-    def begins(self, function: str, kind: str, kept: bool) -> None:
-        """Announce that a function is compiled, whose first argument is of this kind, and whether that is kept."""
+    def begins(self, function: str, kind: str, kept: bool, why: str = "") -> None:
+        """Announce that a function is compiled, whose first argument is of this kind; whether that is kept, and why."""
         often = "only once: later runs find it on the disk" if kept else _NOT_KEPT
-        text = f"compiling {LONG.get((function, kind), 'a small part, some seconds')}, {often}"
+        text = f"compiling {LONG.get((function, kind), 'a small part, some seconds')}, {often}{why}"
         wanted = _LOG.level in (logging.NOTSET, logging.INFO)
         if wanted and self._bar is None and sys.stderr is not None and sys.stderr.isatty():
             self._bar = Bar(text.partition(":")[0], endless=True)
