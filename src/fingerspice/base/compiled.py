@@ -30,6 +30,7 @@ from numba.core.compiler import CompileResult, Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.datamodel import models
 from numba.core.datamodel.registry import register_default
+from numba.core.runtime.nrt import rtsys
 from numba.core.targetconfig import ConfigStack
 from numba.core.types.functions import BaseFunction
 from numba.core.typing.templates import AttributeTemplate, make_concrete_template
@@ -97,7 +98,7 @@ def _why() -> str:
     return f"; the compiled code that came with the package {other}" if came else ""
 
 
-class _Cache(NullCache):  # type: ignore[misc]
+class _Cache(NullCache):
     """Compiled code of a function on the disk, a file for each signature and processor, found by the hash of its key.
 
     There is no index, which processes that compile at once could spoil, and which takes as long to read as the code.
@@ -124,7 +125,8 @@ class _Cache(NullCache):  # type: ignore[misc]
 
     def load_overload(self, sig: Any, context: Any) -> Any:
         """The code for a signature; None where it has to be compiled, which is announced."""
-        context.refresh()
+        # What compiled code needs while it runs; numba prepares for compiling as well, which takes as long as a run.
+        rtsys.initialize(context)
         for file in self._files(sig, context.codegen()):
             for folder in _folders():
                 # Damaged files raise whatever their bytes happen to say.
@@ -151,15 +153,16 @@ def _sealed(data: Any) -> str:
 
 
 def _packed(cres: Any) -> Any:
-    """What numba keeps of compiled code, but for the code that compiled code calls, which is made anew, and a listing.
+    """What numba keeps of compiled code, but for a listing, and for the code that compiled code calls: it is made anew.
 
-    These are three quarters. numba wants to know which names the object code defines.
+    These are three quarters. numba wants to know which names the object code defines. Environments without constants
+    are of no use to it, and reading them would import all of numba that was inlined, and scipy.
     """
-    (name, kind, (code, _)), *rest = cres._replace(type_annotation="")._reduce()
+    (name, kind, (code, _)), *rest, environments = cres._replace(type_annotation="")._reduce()
     module = cres.library._final_module
     defined = {x.name for group in (module.functions, module.global_variables) for x in group if not x.is_declaration}
     names = parse_assembly("\n".join(f'@"{x}" = global i8 0' for x in sorted(defined)))
-    return (name, kind, (code, names.as_bitcode())), *rest
+    return (name, kind, (code, names.as_bitcode())), *rest, tuple(x for x in environments if x.consts)
 
 
 class _Body(JITCodeLibrary):
