@@ -78,11 +78,16 @@ def _kept() -> Any:
     return None
 
 
+def cache_folder() -> str | None:
+    """The folder where compiled code is kept; None if none can be written."""
+    return None if _kept() is None else str(_kept().locator.get_cache_path())
+
+
 @cache
 def _folders() -> list[Any]:
     """Folders of compiled code: where it is kept, this file's, and the one that came with the package."""
-    own = [] if _kept() is None else [_kept().locator.get_cache_path()]
-    return [cast(Any, IndexDataCacheFile)(str(p), "", "") for p in (*own, _OWN.parent / "__pycache__", CAME / TAG)]
+    folders = [p for p in (cache_folder(), _OWN.parent / "__pycache__", CAME / TAG) if p is not None]
+    return [cast(Any, IndexDataCacheFile)(str(p), "", "") for p in folders]
 
 
 @cache
