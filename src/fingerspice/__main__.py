@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from types import FrameType
@@ -38,6 +39,8 @@ def main() -> None:
         # Everything has been written: a signal during the interpreter's shutdown is ignored.
         for number in _STOPS:
             signal.signal(number, signal.SIG_IGN)
+        # Else the interpreter would look through a million objects for cycles before it ends, for a fifth of a run.
+        gc.freeze()
 
 
 if __name__ == "__main__":

@@ -21,8 +21,10 @@ LONG = {
     ("engine.implicit.advance", "Nodal"): "implicit steps, about 15 s",
     ("engine.lockstep.march.march", ""): "scenes in lockstep, about 15 s",
 }
-_NO_FOLDER = "no folder for compiled code can be written, neither the package's nor the user's"
-_NOT_KEPT = f"at every run: {_NO_FOLDER}; set NUMBA_CACHE_DIR to one that can"
+NO_FOLDER = (
+    "no folder for compiled code can be written, neither the package's nor the user's; set NUMBA_CACHE_DIR to one that "
+    "can"
+)
 
 
 class Bar:
@@ -103,10 +105,10 @@ class Compiling:
                 self._bar.stop()
                 self._bar = None
 
-    def begins(self, function: str, kind: str, kept: bool) -> None:
-        """Announce that a function is compiled, whose first argument is of this kind, and whether that is kept."""
-        often = "only once: later runs find it on the disk" if kept else _NOT_KEPT
-        text = f"compiling {LONG.get((function, kind), 'a small part, some seconds')}, {often}"
+    def begins(self, function: str, kind: str, kept: bool, why: str = "") -> None:
+        """Announce that a function is compiled, whose first argument is of this kind; whether that is kept, and why."""
+        often = "only once: later runs find it on the disk" if kept else f"at every run: {NO_FOLDER}"
+        text = f"compiling {LONG.get((function, kind), 'a small part, some seconds')}, {often}{why}"
         wanted = _LOG.level in (logging.NOTSET, logging.INFO)
         if wanted and self._bar is None and sys.stderr is not None and sys.stderr.isatty():
             self._bar = Bar(text.partition(":")[0], endless=True)

@@ -13,19 +13,24 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from llvmlite.binding import parse_assembly
+from numba import __version__ as numba_version
 from numba import njit, types
 from numba.core import cgutils, config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.caching import CompileResultCacheImpl, IndexDataCacheFile, NullCache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Flags, compile_extra
+from numba.core.compiler import CompileResult, Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.datamodel import models
 from numba.core.datamodel.registry import register_default
+from numba.core.runtime.nrt import rtsys
 from numba.core.targetconfig import ConfigStack
 from numba.core.types.functions import BaseFunction
 from numba.core.typing.templates import AttributeTemplate, make_concrete_template
@@ -44,73 +49,125 @@ _SOURCES = [_OWN, *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name
 #: Hash of the compiled code's sources. By content, so that a package that is copied, or packed into an image, keeps its
 #: compiled code.
 STAMP = hashlib.sha256(b"".join(p.name.encode() + p.read_bytes() for p in _SOURCES)).hexdigest()
+_V2 = {"cx16", "popcnt", "sahf", "sse3", "sse4.1", "sse4.2", "ssse3"}
+#: Processors for which a wheel may hold compiled code, the best first, each with the instruction sets that it has.
+LEVELS = {
+    "x86-64-v3": _V2 | {"avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"},
+    "x86-64-v2": _V2,
+    "generic": {"neon"},
+}
+#: Folder of the compiled code that came with the package, and in it the one for this interpreter and compiler.
+CAME = _PACKAGE / "objects"
+TAG = f"{sys.implementation.cache_tag}-numba-{numba_version}"
 _COMPILER = Compiling()
 
 
 def _drop_stale_cache() -> None:
-    """Delete cached code in the package that no key matches any more."""
-    record = _PACKAGE / "__pycache__" / "compiled.stamp"
-    try:
-        if record.is_file() and record.read_text() == STAMP:
-            return
-        for kind in ("*.nbi", "*.nbc"):
-            for file in _PACKAGE.rglob(kind):
+    """Delete cached code in the package that no name fits any more."""
+    with suppress(OSError):
+        for file in (_OWN.parent / "__pycache__").glob("*.nbc"):
+            if not file.name.startswith(STAMP[:12]):
                 file.unlink(missing_ok=True)
-        record.parent.mkdir(exist_ok=True)
-        record.write_text(STAMP)
-    except OSError:
-        # A package that cannot be written has its cache elsewhere, and is replaced as a whole.
-        return
 
 
-_InPackage: Any = next(c for c in CompileResultCacheImpl._locator_classes if c.__name__.endswith("InTreeCacheLocator"))
+@cache
+def _kept() -> Any:
+    """numba's choice of a folder that can be written, NUMBA_CACHE_DIR, this file's or the user's; None without any."""
+    with suppress(RuntimeError):
+        return cast(Any, CompileResultCacheImpl)(_of_kind)
+    return None
 
 
-class _ReadOnly(_InPackage):  # type: ignore[misc]
-    """The package's own folder, for reading alone, if no folder can be written."""
-
-    def ensure_cache_path(self) -> None:
-        return
+def cache_folder() -> str | None:
+    """The folder where compiled code is kept; None if none can be written."""
+    return None if _kept() is None else str(_kept().locator.get_cache_path())
 
 
-class _Place(CompileResultCacheImpl):
-    _locator_classes = [*CompileResultCacheImpl._locator_classes, _ReadOnly]  # noqa: RUF012
+@cache
+def _folders() -> list[Any]:
+    """Folders of compiled code: where it is kept, this file's, and the one that came with the package."""
+    folders = [p for p in (cache_folder(), _OWN.parent / "__pycache__", CAME / TAG) if p is not None]
+    return [cast(Any, IndexDataCacheFile)(str(p), "", "") for p in folders]
 
 
-class _Cache(FunctionCache):
-    """numba's cache of a function, for this state of the shared folders.
+@cache
+def _source(file: str) -> str:
+    """Hash of a file; empty for those in the stamp."""
+    return "" if Path(file) in _SOURCES else hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
-    Compiled code that came with the package is read even if nothing can be written. If the disk is full, the next
+
+def _why() -> str:
+    """Why the code that came with the package, if there is any, is not used."""
+    came = sorted(p.name for p in CAME.glob("*"))
+    other = f"is for {', '.join(came)}" if TAG not in came else "is for other processors, arguments or sources"
+    return f"; the compiled code that came with the package {other}" if came else ""
+
+
+class _Cache(NullCache):
+    """Compiled code of a function on the disk, a file for each signature and processor, found by the hash of its key.
+
+    There is no index, which processes that compile at once could spoil, and which takes as long to read as the code.
+    Code for the processor itself is looked for first, then code for a level of instructions that the processor has,
+    as wheels hold it. A file that cannot be read, or that is damaged, counts as absent. If the disk is full, the next
     process compiles again. Compilation is announced, because it takes long.
     """
 
-    _impl_class = _Place
-
     def __init__(self, function: Callable[..., Any]) -> None:
-        cast(Any, super()).__init__(function)
-        place: Any = self._impl
-        came = _InPackage(function, function.__code__.co_filename).get_cache_path()
-        self._came = cast(Any, IndexDataCacheFile)(came, place.filename_base, place.locator.get_source_stamp())
+        self._function, self._name = function, f"{function.__module__}.{function.__qualname__}"
 
-    def _index_key(self, sig: Any, codegen: Any) -> Any:
-        return (*cast(Any, super())._index_key(sig, codegen), STAMP)
+    def _files(self, sig: Any, codegen: Any) -> Iterator[str]:
+        code = self._function.__code__
+        key = hashlib.sha256(repr((TAG, STAMP, sig, code.co_code, _source(code.co_filename))).encode())
+        triple, cpu, features = codegen.magic_tuple()
+        # A processor's name stands for tuning as well; only its instruction sets matter.
+        levels = [
+            name for name, needed in LEVELS.items() if needed <= {x[1:] for x in features.split(",") if x[0] == "+"}
+        ]
+        for target in [(cpu, features), *((level, "") for level in levels)]:
+            whole = key.copy()
+            whole.update(repr((triple, target)).encode())
+            yield f"{STAMP[:12]}-{self._name}-{whole.hexdigest()[:32]}.nbc"
 
-    def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        key = self._index_key(sig, target_context.codegen())
-        for place in (self._cache_file, self._came):
-            # A file that cannot be read counts as absent.
-            with suppress(OSError):
-                data = place.load(key)
-                if data is not None:
-                    return cast(Any, self._impl).rebuild(target_context, data)
-        name = f"{self._py_func.__module__}.{self._py_func.__qualname__}".removeprefix("fingerspice.")
+    def load_overload(self, sig: Any, context: Any) -> Any:
+        """The code for a signature; None where it has to be compiled, which is announced."""
+        # What compiled code needs while it runs; numba prepares for compiling as well, which takes as long as a run.
+        rtsys.initialize(context)
+        for file in self._files(sig, context.codegen()):
+            for folder in _folders():
+                # Damaged files raise whatever their bytes happen to say.
+                with suppress(Exception):
+                    seal, data = folder._load_data(file)
+                    if seal == _sealed(data):
+                        return cast(Any, CompileResult)._rebuild(context, *data)
         kind = getattr(sig[0], "instance_class", None) if sig else None
-        _COMPILER.begins(name, kind.__name__ if kind else "", not isinstance(self._impl.locator, _ReadOnly))
+        name = self._name.removeprefix("fingerspice.")
+        _COMPILER.begins(name, kind.__name__ if kind else "", _kept() is not None, _why())
         return None
 
-    def save_overload(self, sig: Any, data: Any) -> None:
-        with suppress(OSError):
-            cast(Any, super()).save_overload(sig, data)
+    def save_overload(self, sig: Any, cres: Any) -> None:
+        """Keep the code for a signature, if there is a folder for it."""
+        if _kept() is not None and _kept().check_cachable(cres):
+            with suppress(OSError):
+                data = _packed(cres)
+                _folders()[0]._save_data(next(self._files(sig, cres.codegen)), (_sealed(data), data))
+
+
+def _sealed(data: Any) -> str:
+    """Hash of the object code, so that code of which the disk lost a part is never run."""
+    return hashlib.sha256(data[0][2][0]).hexdigest()
+
+
+def _packed(cres: Any) -> Any:
+    """What numba keeps of compiled code, but for a listing, and for the code that compiled code calls: it is made anew.
+
+    These are three quarters. numba wants to know which names the object code defines. Environments without constants
+    are of no use to it, and reading them would import all of numba that was inlined, and scipy.
+    """
+    (name, kind, (code, _)), *rest, environments = cres._replace(type_annotation="")._reduce()
+    module = cres.library._final_module
+    defined = {x.name for group in (module.functions, module.global_variables) for x in group if not x.is_declaration}
+    names = parse_assembly("\n".join(f'@"{x}" = global i8 0' for x in sorted(defined)))
+    return (name, kind, (code, names.as_bitcode())), *rest, tuple(x for x in environments if x.consts)
 
 
 class _Body(JITCodeLibrary):
@@ -201,7 +258,7 @@ def _cached(*, noalias: bool = False, **options: Any) -> Callable[[Function], Fu
     def compile_when_called(function: Function) -> Function:
         # numba would take options that are missing here from whichever caller comes first.
         compiled = njit(**{"error_model": "numpy", "nogil": True, "fastmath": False, **options})(function)
-        compiled._cache = cast(Any, _Cache)(function)
+        compiled._cache = _Cache(function)
         compile_signature = compiled.compile
 
         def announced(signature: Any) -> Any:

@@ -17,7 +17,7 @@ import typer
 from typer import Argument, Option
 
 import fingerspice as fs
-from fingerspice.base.announcing import paced
+from fingerspice.base.announcing import NO_FOLDER, paced
 from fingerspice.base.arrays import positive_row
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
@@ -411,6 +411,22 @@ def check(
     job.give(lambda: f"{store}: {sum(chunks.values()):,} chunks of {len(chunks)} arrays are as they were written")
 
 
+def warm(job: Job) -> None:
+    """Compile everything that runs may need, in two processes, and keep it: no later run waits for the compiler.
+
+    Example:
+      fingerspice warm
+    """
+    from fingerspice.base.compiled import cache_folder
+    from fingerspice.cli.warm import warm_up
+
+    folder = cache_folder()
+    refuse(folder is None, f"compiled code cannot be kept: {NO_FOLDER}")
+    with paced("compiling") as update:
+        warm_up(update)
+    job.give(lambda: f"all is compiled, in {folder}")
+
+
 _SHORT = 1.0  # Resistance of a shorted gap, ohm
 _FILES = "deck out name overwrite"
 _END = "json no_plot"
@@ -432,6 +448,7 @@ _COMMANDS: dict[Callable[..., None], str] = {
     sets: "name json",
     help_deck: "json",
     check: "store json",
+    warm: "json",
 }
 for _function, _options in _COMMANDS.items():
     add_command(app, _options, _function)

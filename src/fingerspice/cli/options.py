@@ -170,6 +170,11 @@ class Job:
         if self.about and self.files:
             self.make_folder()
         written: list[str] = self.answer["files"]
+        if any(end.endswith(".png") for end in self.files):
+            from matplotlib import artist
+
+            # While it is imported, matplotlib writes documentation of its classes for a tenth of a run.
+            artist.kwdoc = lambda artist: ""
         try:
             for end, file in self.files.items():
                 if not end.endswith(".png"):

@@ -36,7 +36,7 @@ OWN = {
         "fit-contact": "gap parameters correlation relations objective notes profiles",
         "sweep": "scenes failed n seed figures shares store",
         "export": "", "figures": "", "explore": "url", "sets": "parameter_sets", "check": "chunks",
-        "help-deck": "vocabulary",
+        "help-deck": "vocabulary", "warm": "",
     }.items()
 }  # fmt: skip
 #: Keys that are options, too: an answer has them as they are given, until more is known.
