@@ -133,8 +133,8 @@ def test_the_error_of_skin_data_at_one_frequency_follows_the_circuit_not_the_one
 
 
 def test_directives_without_effect_are_warned_about_but_not_those_for_ngspice() -> None:
-    (text,) = of(table1(extra=".print tran v(top)\n.nodeset v(area)=35\n.options reltol=1e-4"))
-    assert text == ".print has no effect here"
+    (text,) = of(table1(extra=".plot tran v(top)\n.nodeset v(area)=35\n.options reltol=1e-4"))
+    assert text == ".plot has no effect here"
 
 
 def test_a_source_that_is_not_named_stays_on_and_is_warned_about() -> None:

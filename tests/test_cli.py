@@ -151,13 +151,13 @@ def test_a_skin_at_another_frequency_or_too_much_voltage_is_warned_about_once(co
 
 
 def test_what_the_reader_notices_is_printed_once_with_its_line(command: Command) -> None:
-    lines = ".nodeset v(area)=35\n.backanno\n.print tran v(top)\n.options reltol=1e-4 trtol=7\n.end"
+    lines = ".nodeset v(area)=35\n.backanno\n.plot tran v(top)\n.options reltol=1e-4 trtol=7\n.end"
     Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", lines)))
     result = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200")
     first, second = (line for line in result.lines if "note" not in line)
     assert "note: .options reltol, trtol: of no effect here, where --rtol alone sets the error" in result.err
     assert first.startswith("fingerspice: warning: pad.cir:5:41: Xgap r: '1MOhm' is milli (0.001 ohm)")
-    assert second == "fingerspice: warning: .print has no effect here"
+    assert second == "fingerspice: warning: .plot has no effect here"
 
 
 def test_values_on_the_command_line_have_the_traps_of_the_deck(command: Command) -> None:

@@ -51,6 +51,22 @@ def test_a_run_is_read_back_to_the_bit_and_ngspice_loads_it(tmp_path: Path) -> N
     assert "10001 points" in str(loaded).replace(",", "") or "points, 1 runs" in str(loaded)
 
 
+def test_save_chooses_the_columns_of_tables_and_raw_files(tmp_path: Path) -> None:
+    first = ".save all V(top) @xgap[f_el] v(top, skin)\n.print tran i(Vdrive) V(area)\n.print ac v(top)"
+    lines = f"{first}\n.probe par('v(top)*2') V(nix)"
+    with pytest.warns(fs.FingerspiceWarning, match=r"no node 'nix'.*; it is left out of the files"):
+        circuit = fs.parse_netlist(table1().text.replace(".end", f"{lines}\n.end"))
+    run = fs.simulate(circuit, rtol=1e-4)
+    head, *rows = run.to_csv(tmp_path / "run.csv").read_text().splitlines()
+    assert head == ("t [s],V(top) [V],@xgap[f_el] [N],\"v(top, skin) [V]\",i(Vdrive) [A],V(area) [mm^2],'v(top)*2' [1]")
+    values = np.loadtxt(rows, delimiter=",")
+    expected = [run.t, run.node_voltages["top"], run.f_el, run.u_gap, -np.asarray(run.i_source), 1e6 * run.area]
+    np.testing.assert_allclose(values[:, :6], np.column_stack(expected), rtol=1e-12, atol=1e-12)
+    raw = fs.read_raw(run.to_raw(tmp_path / "run.raw"))
+    assert list(raw.vectors) == ["time", "v(top)", "@xgap[f_el]", "v(top,skin)", "i(vdrive)", "v(area)", "'v(top)*2'"]
+    np.testing.assert_array_equal(raw.vectors["'v(top)*2'"], 2.0 * run.node_voltages["top"])
+
+
 def test_ngspices_files_are_read_binary_and_ascii_and_compared(tmp_path: Path, command: Callable[..., Any]) -> None:
     circuit = table1(tran="10u 20m 0 1u uic")
     (tmp_path / "deck.cir").write_text(fs.export_netlist(circuit))

@@ -172,6 +172,8 @@ class Circuit(Remembering, Shown):
         Of its `.meas` lines.
     fourier : tuple of tuple of float and Quantity
         Of its `.four` lines: fundamental, Hz, and vector.
+    saved : tuple of Quantity
+        Of its `.save`, `.probe` and `.print` lines: the columns of tables and raw files; of all signals if empty.
     steps, dc : tuple of Step
         Of its `.step` lines, and of its `.dc` line, the innermost first.
     op : bool
@@ -195,6 +197,7 @@ class Circuit(Remembering, Shown):
     sets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     measures: tuple[Measure, ...] = ()
     fourier: tuple[tuple[float, Quantity], ...] = ()
+    saved: tuple[Quantity, ...] = ()
     steps: tuple[Step, ...] = ()
     dc: tuple[Step, ...] = ()
     op: bool = False

@@ -1,4 +1,4 @@
-"""The grammar of `.meas`, `.four`, `.step` and `.dc` lines."""
+"""The grammar of `.meas`, `.four`, `.save`, `.step` and `.dc` lines."""
 
 from __future__ import annotations
 
@@ -265,6 +265,26 @@ def read_fourier(
     found = [(frequency, words.quantity())]
     while words.at < len(words.words):
         found.append((frequency, words.quantity()))
+    return found
+
+
+def read_saved(
+    line: Line, start: int, params: Mapping[str, float], elements: Sequence[Element], notes: list[str]
+) -> list[Quantity]:
+    """The vectors of a `.save`, `.probe` or `.print tran` line; those that the circuit lacks make a warning each."""
+    words, found = _Line(line, start, params, elements, ".save"), list[Quantity]()
+    if words.word("ac", "dc", "op", "noise"):
+        return []
+    words.word("tran")
+    while words.at < len(words.words):
+        place, first = words.where, words.at
+        if words.word("all", "allv", "alli"):
+            continue
+        try:
+            found.append(words.quantity())
+        except InputError as error:
+            words.at = max(words.at, first + 1)
+            notes.append(f"{place}: {error.message}; it is left out of the files")
     return found
 
 

@@ -21,7 +21,7 @@ from fingerspice.circuit.network import checked
 from fingerspice.netlist.deck import parse_deck, with_comma
 from fingerspice.netlist.expressions import Call, Number, Token, Value, number
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
-from fingerspice.netlist.measures import checked_steps, read_dc, read_fourier, read_measure, read_step
+from fingerspice.netlist.measures import checked_steps, read_dc, read_fourier, read_measure, read_saved, read_step
 from fingerspice.netlist.reader import MAX_WARNINGS, OTHERS, Context, Deck, Statement, text_of
 from fingerspice.netlist.sources import read_source
 from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
@@ -96,11 +96,13 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
         notes[MAX_WARNINGS:] = [f"{more} more warnings are not shown"]
     laws = {"mobile" if "mobile" in name.lower() else "local" for name in deck.libraries}
     ac, measures = next(map(read_ac, deck.directives[".ac"]), None), list[Measure]()
-    fourier, steps, dc = list[tuple[float, Quantity]](), list[Step](), tuple[Step, ...]()
+    saved, fourier, steps, dc = list[Quantity](), list[tuple[float, Quantity]](), list[Step](), tuple[Step, ...]()
     for name, line, start in deck.asked:
         match name:
             case ".four":
                 fourier += read_fourier(line, start, deck.params, elements)
+            case ".save" | ".probe" | ".print":
+                saved += read_saved(line, start, deck.params, elements, notes)
             case ".step":
                 steps.append(read_step(line, start, deck.params, elements))
             case ".dc":
@@ -110,7 +112,11 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     refuse(len(laws) > 1, "both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
     law, said, effectless = next(iter(laws), None), tuple(notes), (*deck.unused, *unused, *unused_starts)
     read = deck.title, elements, tran, ac, initial, law, work, said, effectless, deck.text, deck.path
-    stepped: dict[str, Any] = {"steps": checked_steps(steps, ".step"), "dc": checked_steps(dc, ".dc")}
+    stepped: dict[str, Any] = {
+        "saved": tuple(saved),
+        "steps": checked_steps(steps, ".step"),
+        "dc": checked_steps(dc, ".dc"),
+    }
     stepped["op"] = any(name == ".op" for name, _, _ in deck.asked)
     return checked(Circuit(*read, measures=tuple(measures), fourier=tuple(fourier), **stepped))
 

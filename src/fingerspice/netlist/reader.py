@@ -189,10 +189,10 @@ MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
 _USED = (
-    ".tran", ".ac", ".op", ".dc", ".step", ".meas", ".measure", ".four", ".options", ".ic", ".param", ".func",
-    ".global", ".subckt", ".ends", ".include", ".inc", ".lib", ".endl", ".control", ".end",
+    ".tran", ".ac", ".op", ".dc", ".step", ".meas", ".measure", ".four", ".save", ".probe", ".print", ".options",
+    ".ic", ".param", ".func", ".global", ".subckt", ".ends", ".include", ".inc", ".lib", ".endl", ".control", ".end",
 )  # fmt: skip
-_UNUSED = (".print", ".plot", ".save", ".probe", ".title")
+_UNUSED = (".plot", ".title")
 #: Every directive that may stand in a deck; `Deck._direct` says what is done with it.
 DIRECTIVES = (*_USED, ".option", *_UNUSED, ".nodeset", ".backanno", ".endc")
 
@@ -323,7 +323,7 @@ class Deck:
                     for other, first, _ in here.directives:
                         refuse(other == name, f"{name} is given twice, first at {first.where()}", place)
                 here.directives.append((".options" if name == ".option" else name, line, rest))
-            case ".meas" | ".measure" | ".four" | ".step" | ".dc" | ".op":
+            case ".meas" | ".measure" | ".four" | ".step" | ".dc" | ".op" | ".save" | ".probe" | ".print":
                 refuse(here is not self.root, f"{name} does not belong inside .subckt {here.name}", place)
                 self.asked.append((name, line, rest))
             case ".param":

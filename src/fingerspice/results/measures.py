@@ -17,7 +17,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.measures import LAST, PARTS, Crossing, Measure, Quantity, Vector
 from fingerspice.circuit.network import network_of
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
-from fingerspice.results.record import Signals
+from fingerspice.results.record import Signals, signal_of
 from fingerspice.results.steps import WEIGHTS, Outputs, Stretch, Weighed, weigh_outputs
 
 if TYPE_CHECKING:
@@ -84,6 +84,24 @@ def _vector(solution: Solution, vector: Vector) -> Callable[[Signals], FloatArra
         return found[first]
 
     return current
+
+
+def saved_columns(solution: Solution) -> dict[str, tuple[FloatArray, str]]:
+    """Values (n_t,) and units of what the deck's `.save` lines name, or of all signals."""
+    if not solution.circuit.saved:
+        return {name: (x, unit) for name, (x, unit, _) in solution.signals.items()}
+    found = {}
+    for one in solution.circuit.saved:
+        kind = one.vectors[0].kind if one.function is None else ""
+        unit = {"": "1", "i": "A", "v": "V", "u_layer": "V"}.get(kind) or signal_of(kind).unit
+        # An area node has mm^2, as it is in SPICE.
+        areas = areas_of(solution.record, solution.circuit)
+        unit = "mm^2" if kind == "v" and set(one.vectors[0].names) <= areas.keys() else unit
+        try:
+            found[one.text] = values_of(solution, one)(solution.record), unit
+        except Failed:
+            found[one.text] = np.full(solution.t.size, math.nan), unit
+    return found
 
 
 def areas_of(record: Signals, circuit: Circuit) -> dict[str, FloatArray]:

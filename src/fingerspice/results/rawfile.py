@@ -16,7 +16,7 @@ from fingerspice.base.arrays import whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.base.pages import Page, Shown, Table
-from fingerspice.results.measures import areas_of, currents_of
+from fingerspice.results.measures import areas_of, currents_of, saved_columns
 from fingerspice.waveforms.files import file_fault
 from fingerspice.waveforms.waveform import refuse
 
@@ -73,8 +73,17 @@ def write_raw(solution: Solution, path: Path) -> Path:
         elif key not in ("u_source", "u_layer", "q_source", "i_source", "fold_margin"):
             owner = element or (solution.gaps[0] if solution.gaps else "")
             columns[f"@{owner.lower()}[{key}]" if owner else key] = values, _KINDS.get(unit, "notype")
+    if solution.circuit.saved:
+        chosen = saved_columns(solution).items()
+        columns = {"time": (solution.t, "time")} | {"".join(name.lower().split()): (x, _KINDS.get(unit, "notype"))
+                                                    for name, (x, unit) in chosen}  # fmt: skip
+        return _written(solution, columns, path)
     columns |= {f"v({node})": (x, "voltage") for node, x in areas_of(solution.record, solution.circuit).items()}
     columns |= {f"i({name})": (x, "current") for name, x in currents_of(solution.record, solution.circuit).items()}
+    return _written(solution, columns, path)
+
+
+def _written(solution: Solution, columns: Mapping[str, tuple[NDArray[Any], str]], path: Path) -> Path:
     head = [
         f"Title: {solution.circuit.title}", "Date: -", "Plotname: Transient Analysis", "Flags: real",
         f"No. Variables: {len(columns)}", f"No. Points: {solution.t.size}", "Variables:",

@@ -18,7 +18,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
 from fingerspice.numerics.lobatto import NODES
-from fingerspice.results.measures import Measuring
+from fingerspice.results.measures import Measuring, saved_columns
 from fingerspice.results.outcome import ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import (
     Sealed,
@@ -401,16 +401,18 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured, Measuring):
         }  # fmt: skip
 
     def to_csv(self, path: str | Path) -> Path:
-        """Write every signal as CSV with names and units in the header; a jump has both its rows.
+        """Write every signal, or those of the deck's `.save`, as CSV with names and units in the header.
+
+        A jump has both its rows.
 
         Raises
         ------
         InputError
             Where the folder cannot be written.
         """
-        signals = self.signals
-        header = ["t [s]", *(f"{name} [{unit}]" for name, (_, unit, _) in signals.items())]
-        table = np.column_stack([self.t, *(value for value, _, _ in signals.values())])
+        columns = saved_columns(self)
+        header = ["t [s]", *(f"{name} [{unit}]" for name, (_, unit) in columns.items())]
+        table = np.column_stack([self.t, *(value for value, _ in columns.values())])
         return write_csv(path, header, (row.tolist() for row in table))
 
     def to_xarray(self, *, jumps: str = "right") -> xarray.Dataset:
