@@ -27,8 +27,11 @@ MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
+#: Forms of a controlled source that follows otherwise than in proportion, by the word after its nodes.
+NONLINEAR = ("POLY", "VALUE", "TABLE", "LAPLACE", "FREQ", "CHEBYSHEV", "VOL", "CUR")
+
 _STATEMENT = re.compile(  #: Titles that are probably the netlist's first statement.
-    rf"[rcvi]\w*\s+\S+\s+\S+\s+(?:\{{|'|[-+.\d]|(?:dc|ac|sine|{'|'.join(SOURCES)})\b)"
+    rf"[rclvi]\w*\s+\S+\s+\S+\s+(?:\{{|'|[-+.\d]|(?:dc|ac|sine|{'|'.join(SOURCES)})\b)"
     rf"|(?:x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(called_devices())})|{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
     re.IGNORECASE,
 )
@@ -116,7 +119,7 @@ class _Instance:
         first = lexemes[0]
         where, letter = first.where, first.text[:1].upper()
         if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
-            problem = f"'{first.written}' is no element: a line begins with R, C, V, I, X or a dot, a comment with *"
+            problem = f"'{first.written}' is no element: a line begins with R, C, L, V, I, E, F, G, H, K, X or a dot, a comment with *"
             raise InputError(problem, where)
         if letter != "X" and letter not in DEVICES:
             raise InputError(_unknown_element(lexemes), where)
@@ -128,15 +131,28 @@ class _Instance:
         if letter == "X":
             self._call(name, lexemes)
             return
-        scope, words = self.scope, group(lexemes[1:], plain=2)
-        nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
-        missing = "node" if len(nodes) < 2 else "" if len(words.words) > 2 or words.params else "value"
-        refuse(missing, f"missing {missing}: a {DEVICES[letter].what} is written {name} node node value", where)
-        canonical, written = zip(*self.nodes(nodes), strict=True)
-        # A word of a resistor or capacitor names a parameter, those of a source are keywords (DC, SIN).
-        bare: Bare = "name" if letter in "RC" else "nothing"
-        body, params = scope.words(words.words[2:], bare), scope.pairs(words, bare)
-        self.deck.statements.append(Statement(name, letter, canonical, written, body, params, where))
+        spec = DEVICES[letter]
+        form = ["node"] * len(spec.nodes) + [*spec.control]
+        scope, words = self.scope, group(lexemes[1:], plain=len(form))
+        # A coupling may be one of more than two inductors.
+        count = max(len(form), len(words.words) - 1) if letter == "K" else len(form)
+        heads = [word for word in words.words[:count] if isinstance(word, Lexeme)]
+        other = [x.text for x in lexemes[3:4] if spec.control and x.text.upper() in NONLINEAR]
+        written_so = f"a {spec.what} is written {name} {' '.join(form)} value"
+        refuse(other, f"{name} is given by {other and other[0]}: {written_so}, and follows in proportion only", where)
+        missing = form[len(heads)] if len(heads) < len(form) else ""
+        missing = missing or ("" if len(words.words) > count or words.params else "value")
+        refuse(missing, f"missing {missing}: {written_so}", where)
+        found = self.nodes(heads[: len(spec.nodes)])
+        canonical, written = tuple(x for x, _ in found), tuple(x for _, x in found)
+        rest = heads[len(spec.nodes) :]
+        control = tuple(x for x, _ in self.nodes(rest)) if "node" in spec.control else tuple(
+            f"{self.prefix}{x.text}".lower() for x in rest
+        )  # fmt: skip
+        # A word of a source is a keyword (DC, SIN), that of any other element names a parameter.
+        bare: Bare = "nothing" if letter in "VI" else "name"
+        body, params = scope.words(words.words[count:], bare), scope.pairs(words, bare)
+        self.deck.statements.append(Statement(name, letter, canonical, written, body, params, where, control))
 
     def _call(self, name: str, lexemes: list[Lexeme]) -> None:
         """An X line: a native device becomes a statement, and a subcircuit is expanded."""
@@ -226,4 +242,4 @@ def _unknown_element(lexemes: list[Lexeme]) -> str:
         return f"'{name}': a directive begins with a dot, as in .{name.lower()}"
     kind = OTHERS["elements"].get(name[0].upper())
     what = f"'{name}' is {kind}, which is not supported" if kind else f"'{name}' is no known element"
-    return f"{what}; elements are R, C, V, I, and X with {', '.join(called_devices())} or a .subckt"
+    return f"{what}; elements are R, C, L, K, V, I, E, F, G, H, and X with {', '.join(called_devices())} or a .subckt"

@@ -161,14 +161,14 @@ def sweep_from_text(text: str) -> AcSweep:
 
 def read_elements(statement: Statement, context: Context, notes: list[str]) -> list[Element]:
     """The element of a statement, and those for LTspice's ``Rser``, ``Rpar`` and ``Cpar``; `notes` gets warnings."""
-    name, device, nodes, names, _, params, where = statement
+    name, device, nodes, names, _, params, where, control = statement
     beside = {key: params[key] for key in DEVICES[device].beside if key in params}
     own = statement._replace(params={k: v for k, v in params.items() if k not in beside})
-    read: dict[str, Any] = {}
+    read: dict[str, Any] = {"control": control} if control else {}
     values: dict[str, float] = {}
     if device in "VI":
         read["waveform"], read["ac"] = read_source(own, context, notes)
-    elif device in "RC":
+    elif DEVICES[device].cells is None:
         values, read["initial"] = _read_passive(own, notes)
     else:
         if device == "GAP" and "law" in own.params:
@@ -176,7 +176,7 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
         values = _device_values(own, read.get("law"), notes)
     element = Element(name, device, nodes, names, MappingProxyType(values), where=where, **read)
     for parameter, text in unusual(element):
-        given = statement.body[0] if parameter == "value" and statement.body else params.get(parameter)
+        given = statement.body[0] if statement.body else params.get(parameter)
         # One warning per number is enough.
         if not (isinstance(given, Number) and any(_doubts(given, element.spec.parameter(parameter)))):
             notes.append(f"{where if given is None else given.where}: {text}")
@@ -229,24 +229,26 @@ def _device_values(statement: Statement, law: ContactLaw | None, notes: list[str
 
 
 def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
-    """Value of an R or C, and the start voltage (V) of a C."""
+    """The one value of an element, and the start voltage (V) of a C or current (A) of an L."""
     name, device, params = statement.name, statement.device, statement.params
-    kind, spec = DEVICES[device], DEVICES[device].parameter("value")
-    own = (*kind.aliases, _COPIES, *(("ic",) if device == "C" else ()), *kind.data)
+    kind, (spec,) = DEVICES[device], DEVICES[device].parameters
+    copied = (_COPIES,) if device in "RCL" else ()
+    own = (*kind.aliases, *copied, *(("ic",) if device in "CL" else ()), *kind.data)
     for key, part in params.items():
         if key not in own and not (key == "lser" and isinstance(part, Number) and part.value == 0.0):
             shown = ", ".join(f"{k}=" for k in (*own, *kind.beside))
-            reason = ", there are no inductors here" if key == "lser" else ""
+            reason = "; an inductance in series is an L" if key == "lser" else ""
             raise InputError(f"{name} takes no parameter {key!r}{reason}; allowed: {shown}", part.key)
     given = [*statement.body, *(params[key] for key in kind.aliases if key in params)]
-    refuse(len(given) != 1, f"{name} needs one value in {spec.unit}, {len(given)} are given", statement)
-    value = _value(name, spec, number(given[0], f"{name} value", f"a number {spec.unit}"), notes)
+    unit = f" in {spec.unit}" if spec.unit else ""
+    refuse(len(given) != 1, f"{name} needs one value{unit}, {len(given)} are given", statement)
+    value = _value(name, spec, number(given[0], f"{name} {spec.name}", f"a number {spec.unit}".rstrip()), notes)
     copies = params.get(_COPIES)
     if copies is not None:
         if not isinstance(copies, Number) or not 1e-6 <= copies.value <= 1e6:
             raise InputError(f"{name} m is {copies.text!r}; allowed: a number of parts side by side", copies.where)
-        value = value / copies.value if device == "R" else value * copies.value
-    return {"value": value}, start_volts(f"{name} IC", params["ic"]) if "ic" in params else None
+        value = value * copies.value if device == "C" else value / copies.value
+    return {spec.name: value}, start_volts(f"{name} IC", params["ic"]) if "ic" in params else None
 
 
 def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> float:

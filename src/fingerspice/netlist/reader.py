@@ -207,6 +207,7 @@ class Statement(NamedTuple):
     body: tuple[Word, ...]  # The words after the nodes; empty for an X
     params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
     where: Where  # Place of the name
+    control: tuple[str, ...] = ()  # Nodes or elements that control it, in lower case
 
 
 @dataclass(slots=True)

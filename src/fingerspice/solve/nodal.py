@@ -171,7 +171,7 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
     probing, probed = _with_probes(problem)
     compared = probing.at(probing.t_out[probed], probing.left[probed])
     u_scale = problem.largest
-    if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
+    if problem.network.active or problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
     finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
     tol, nfev, folded = max(LOCAL_SHARE * rtol, finest), 0, math.inf
@@ -239,7 +239,7 @@ def _announced(progress: Progress | None, reason: str) -> Progress:
 
 
 def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:
-    """Largest live voltage, V, from coarse runs: under a current drive it is not known beforehand.
+    """Largest live voltage, V, from coarse runs: under a current drive, or an amplifier, it is not known beforehand.
 
     A high guess is better than a low one: a coarse run whose voltages are much smaller than the guess is cheap, whereas
     much larger voltages would be integrated far too accurately.

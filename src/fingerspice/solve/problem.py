@@ -148,7 +148,7 @@ def prepare(
     return Problem(
         circuit, scene, t_start, end, t_start + (tran.start if tran else 0.0),
         tran.step if tran else (stop - t_start) / 1000.0,
-        initial_state(circuit, scene, "uncharged" if start == "periodic" else start), charge,
+        initial_state(circuit, scene, "uncharged" if start == "periodic" else start), charge or scene.network.senses,
         start if isinstance(start, str) else "given", t_stop is None and tran is not None,
     )  # fmt: skip
 

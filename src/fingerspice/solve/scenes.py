@@ -84,7 +84,9 @@ class Scene(Remembering):
 
     @cached_property
     def rates(self) -> FloatArray:
-        """Decay rates of these modes, 1/s."""
+        """Decay rates of these modes, 1/s; of modes that may oscillate, the real parts."""
+        if self.network.active:
+            return self.network.decay(self.net.area0)
         if self.model is None:
             return self.modes.rates
         rates, _, _, _ = modes(self.model.rate + self.model.rate0 / self.model.area0, self.model.k)
@@ -139,7 +141,7 @@ def scene_of(
         waves = network.waveforms[: network.n_voltage]
         u_peak = sum(_largest_voltage(wave, stop, network.stack is not None) for wave in waves)
         u_size = max(u_peak, sum(wave.cancelling(0.0, stop) for wave in waves))
-        by_current = DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0
+        by_current = DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage or network.active else 0.0
         top = BEYOND_PEAK * u_peak + by_current or PEAK_UNKNOWN
         model = None if network.stack is None else _model(network.stack, law, fixed[0], top)
         return Scene(network, law, mode, fixed, u_peak, u_size, top, model, skin)

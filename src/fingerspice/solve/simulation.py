@@ -222,6 +222,8 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
         reasons += [REPEATS] if span / problem.network.waveform.period >= FEWEST_PERIODS else []
     if chosen == "linear" and model is not None and scene.coupled and np.any(model.rate0 > 0.0):
         needed = changed
+    if problem.network.active:
+        reasons.append("an inductor or an amplifier lets voltages oscillate or grow, which implicit steps take")
     if chosen == "coupled" and problem.network.owned:
         reasons.append("the gap's height, or its leak, follows its voltage, which implicit steps take")
     if scene.skin is not None:
@@ -262,6 +264,8 @@ def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
     stores = scene.coupled and model is not None and model.mobile and problem.stored > 0.0
     if model is not None and not (model.rate.any() or model.rate0.any() or stores):
         return "algebraic", "no layer leaks, so the voltages follow the source at once"
+    if not scene.coupled and problem.network.active:
+        return "coupled", "a network with inductors or amplifiers, whatever its areas"
     if not scene.coupled:
         which = f"the area{' is' if model is not None else 's are'} {scene.area_mode}"
         return "linear", f"{which if scene.fixed else 'no element has an area'}, so the circuit is linear"
@@ -359,7 +363,7 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
     if method == "auto" and (recorded := solve_recording(problem, rtol, progress)) is not None:
         return recorded, "relaxation"
     is_stack, reason = problem.network.stack is not None, ""
-    if problem.network.owned and problem.scene.coupled:
+    if problem.network.active or (problem.network.owned and problem.scene.coupled):
         method = "radau"
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, progress, repeat=method == "auto")

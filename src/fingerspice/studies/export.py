@@ -192,7 +192,8 @@ def _element_line(element: Element, circuit: Circuit, work_ratio: float, start_a
         return f"{head} {_source_text(element.waveform, element.name, circuit)}{ac}"
     if element.spec.cells is None:
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
-        return f"{head} {element.values['value']!r}{initial}"
+        (value,) = element.values.values()
+        return f"{head} {' '.join([*_controls(element, circuit), repr(value)])}{initial}"
     # Left out are what only a warning or the friction needs, and a CPE beside a gap, which is written for itself.
     left_out = ("p_sat", "slip", "v", "q", "n_cpe") if element.device == "GAP" else ("e_max",)
     tabled = element.device == "GAP" and acting_law(element) is not None
@@ -205,6 +206,14 @@ def _element_line(element: Element, circuit: Circuit, work_ratio: float, start_a
     extra += f" a_ic={start_areas[element.nodes[2]]!r}" if held and element.spec.is_layer else ""
     device = f"GAP_{_element_name(element)}" if tabled else element.device
     return f"{head} {device} {values}{extra}"
+
+
+def _controls(element: Element, circuit: Circuit) -> list[str]:
+    """Names of the nodes or elements that control an element."""
+    if "node" not in element.spec.control:
+        return [_element_name(circuit[name]) for name in element.control]
+    written = {node: name for e in circuit.elements for node, name in zip(e.nodes, e.node_names, strict=True)}
+    return [_name(written.get(node, node)) for node in element.control]
 
 
 def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:
