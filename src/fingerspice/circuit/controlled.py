@@ -85,8 +85,9 @@ def _solved(matrix: FloatArray, right: FloatArray, size: FloatArray, elements: S
     cancelled = np.diag(np.abs(inverse) @ size) * _SINGULAR if matrix.size else np.zeros(0)
     if not np.all(cancelled < 1.0):
         named = [e for e, x in zip(elements, cancelled.tolist(), strict=True) if not x < 1.0]
-        said = f"{', '.join(dict.fromkeys(e.name for e in named))} have no solution: what they set, they follow themselves"
-        raise InputError(f"{said} (a loop gain of 1); allowed: another gain, or an R or C in the loop", named[0].where)
+        said = f"the equations of {', '.join(dict.fromkeys(e.name for e in named))} have no solution"
+        allowed = "another gain, a coupling below 1, or an R in the loop"
+        raise InputError(f"{said}: a loop gain is 1, or no resistance is in a loop; allowed: {allowed}", named[0].where)
     return np.asarray(inverse @ right)
 
 

@@ -87,6 +87,8 @@ class Network(Remembering):
     stack: Stack | None = None
     # Whether modes may oscillate or grow, as with inductors and amplifiers: exponential steps do not take such networks
     active: bool = False
+    # (n_voltage,): Largest voltage of a controlled source over that of the source that it follows, or 1; empty for 1
+    lift: tuple[float, ...] = ()
     coils: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # As `Closed.flux`, of the last states
     # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
     kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
@@ -322,7 +324,7 @@ def _closed(network: Network, circuit: Circuit) -> Network:
     between = math.sqrt(min(held) * max(held)) if held else max([e.values["value"] for e in coils] or [1.0]) / widest**2
     found = Matrices(*(getattr(network, name) for name in Matrices._fields))
     made = closed(found, sources, network.node_names, circuit.by_device("K"), between)
-    own, n, states = [i for i, e in enumerate(sources) if e.device in "VI"], network.k.shape[0], len(made.flux)
+    own, states, n_all = [i for i, e in enumerate(sources) if e.device in "VI"], len(made.flux), network.n_voltage
     alike = np.pad(network.resistor_factor, ((0, 0), (0, states)))
     through = (Cell(e, e.nodes, None, between, 0.0, 0.0) for e in coils[:states])
     out = replace(
@@ -331,13 +333,14 @@ def _closed(network: Network, circuit: Circuit) -> Network:
         live=(*network.live, *range(len(network.cells), len(network.cells) + states)),
         resistor_factor=alike, resistor_factor_s=network.resistor_factor_s @ made.sources,
         active=not made.reciprocal, coils=made.flux,
+        lift=tuple(np.abs(made.sources[:n_all, : len(own)]).max(axis=0, initial=1.0).tolist()),
     )  # fmt: skip
     mass = out.cut.T @ (out.capacitance(out.areas_at_rest)[:, None] * out.p)
     size = np.abs(out.cut).T @ (out.capacitance(out.areas_at_rest)[:, None] * np.abs(out.p))
     scale = 1.0 / np.sqrt(np.diag(size))
     if mass.size and not np.linalg.det(scale[:, None] * mass * scale) > _ROUNDING:
         named = [e for e in sources if e.device in "EGFH"]
-        said = f"{', '.join(e.name for e in named)} leave a node without capacitance, or with less than none"
+        said = f"behind {', '.join(e.name for e in named)} a node has no capacitance, or less than none"
         raise InputError(f"{said}; allowed: less gain, or an R in series with the capacitor", named[0].where)
     return out
 

@@ -87,7 +87,7 @@ def _refuse_uncontrolled(ruled: list[Element], branches: list[Element]) -> None:
         known = [one.name.lower() for one in branches if one.device == device] if device else nodes
         for name in e.control:
             near = "".join(f"; is {x!r} meant?" for x in get_close_matches(name, known, 1, 0.7))
-            refuse(name not in known, f"{e.name} is controlled by {kind} {name!r}; allowed: {what}{near}", e)
+            refuse(name not in known, f"{e.name} names the {kind} {name!r}; allowed: {what}{near}", e)
 
 
 def driving(circuit: Circuit) -> list[Element]:

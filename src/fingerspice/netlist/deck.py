@@ -138,7 +138,7 @@ class _Instance:
         count = max(len(form), len(words.words) - 1) if letter == "K" else len(form)
         heads = [word for word in words.words[:count] if isinstance(word, Lexeme)]
         other = [x.text for x in lexemes[3:4] if spec.control and x.text.upper() in NONLINEAR]
-        written_so = f"a {spec.what} is written {name} {' '.join(form)} value"
+        written_so = f"{'an' if spec.what[0] in 'aeiou' else 'a'} {spec.what} is written {name} {' '.join(form)} value"
         refuse(other, f"{name} is given by {other and other[0]}: {written_so}, and follows in proportion only", where)
         missing = form[len(heads)] if len(heads) < len(form) else ""
         missing = missing or ("" if len(words.words) > count or words.params else "value")

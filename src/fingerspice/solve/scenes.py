@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -138,9 +139,9 @@ def scene_of(
             mode = f"{fixed[0]:g} m^2 (from the deck)" if len(fixed) == 1 else "given by the deck" if fixed else "none"
         elif area != "coupled":
             fixed = tuple(map(float, mean_areas(network) if area == "mean" else network.areas_at_rest))
-        waves = network.waveforms[: network.n_voltage]
-        u_peak = sum(_largest_voltage(wave, stop, network.stack is not None) for wave in waves)
-        u_size = max(u_peak, sum(wave.cancelling(0.0, stop) for wave in waves))
+        waves = [*zip(network.waveforms[: network.n_voltage], network.lift or itertools.repeat(1.0), strict=False)]
+        u_peak = sum(lift * _largest_voltage(wave, stop, network.stack is not None) for wave, lift in waves)
+        u_size = max(u_peak, sum(lift * wave.cancelling(0.0, stop) for wave, lift in waves))
         by_current = DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage or network.active else 0.0
         top = BEYOND_PEAK * u_peak + by_current or PEAK_UNKNOWN
         model = None if network.stack is None else _model(network.stack, law, fixed[0], top)

@@ -17,6 +17,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import Parameters, Sources, circuit_warnings, overridden
+from fingerspice.circuit.network import Network
 from fingerspice.physics.contact import inverse_area_range
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
@@ -206,7 +207,7 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     area, changed = float(scene.net.area0[0]) if scene.fixed else math.nan, math.nan if scene.coupled else 0.0
     if model is not None and model.coupled:
         changed, area = _change(model.curve, scene.u_peak)
-    elif scene.coupled and len(problem.network.sources) == problem.network.n_voltage:
+    elif scene.coupled and not unbounded(problem.network):
         changed = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
     best, reason = _best(problem, rtol, changed)
     chosen = best if tier == "auto" else tier
@@ -272,7 +273,7 @@ def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
     if model is None:
         follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
         if math.isnan(changed):
-            return "coupled", f"{follows}; by how much is not known beforehand: a current source sets no bound"
+            return "coupled", f"{follows}; by how much is not known beforehand: {unbounded(problem.network)} sets no bound"
         return "coupled", f"{follows}, {'each ' if several else ''}by up to {_percent(changed)} of its middle"
     free = not model.rate0.any()
     if model.mobile or not (free or changed <= 0.2 * rtol):
@@ -282,6 +283,12 @@ def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
     if free:
         return "linear", "every leak scales with the area, so under the local law no voltage feels it"
     return "linear", f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
+
+
+def unbounded(network: Network) -> str:
+    """What keeps the sources' voltages from bounding those of a network; empty if nothing does."""
+    amplified = "an inductor or an amplifier" if network.active else ""
+    return amplified or ("a current source" if len(network.sources) > network.n_voltage else "")
 
 
 def _percent(share: float) -> str:
