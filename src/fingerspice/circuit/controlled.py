@@ -11,6 +11,7 @@ A network is reduced as if each of them were a source w like the deck's own, and
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -78,10 +79,10 @@ def _windings(coils: Sequence[Element], couplings: Sequence[Element], c: float) 
 
 
 def _solved(matrix: FloatArray, right: FloatArray, size: FloatArray, elements: Sequence[Element]) -> FloatArray:
-    """Solution of equations whose terms have these sizes, one or more for each element; refused where they have none."""
-    inverse = np.full_like(matrix, np.inf)
-    if np.linalg.matrix_rank(matrix) == len(matrix):
-        inverse = np.linalg.inv(matrix)
+    """Solution of equations, one for each element, whose terms have these sizes; refused where there is none."""
+    inverse: FloatArray = np.full_like(matrix, np.inf)
+    with suppress(np.linalg.LinAlgError):
+        inverse = np.asarray(np.linalg.inv(matrix), float)
     cancelled = np.diag(np.abs(inverse) @ size) * _SINGULAR if matrix.size else np.zeros(0)
     if not np.all(cancelled < 1.0):
         named = [e for e, x in zip(elements, cancelled.tolist(), strict=True) if not x < 1.0]
@@ -136,10 +137,11 @@ def closed(
     flows = np.hstack([known[:, : n_x + n_s], found.through[own]])
     j = _solved(np.eye(n_s) - known[:, n_x + n_s :], flows, np.eye(n_s) + loops, [sources[i] for i in own])
     every = np.hstack([w[:, : n_x + n_s], np.zeros((len(sources), len(found.p)))]) + by_j @ j
-    made = _matrices(found, turns, windings, every, n_s)
     nodes = over(found.nodes, w)
-    nodes = nodes if nodes[:, n_x + n_s :].any() else nodes[:, : n_x + n_s]
-    made = made._replace(through=np.pad(j[:, n_x + n_s :], ((0, 0), (0, n_x - n))), delivered=j[:, : n_x + n_s], nodes=nodes)
+    made = _matrices(found, turns, windings, every, n_s)._replace(
+        through=np.pad(j[:, n_x + n_s :], ((0, 0), (0, n_x - n))), delivered=j[:, : n_x + n_s],
+        nodes=nodes if nodes[:, n_x + n_s :].any() else nodes[:, : n_x + n_s],
+    )  # fmt: skip
     fed = np.abs(found.q @ every[:, n_x + n_s :]).max(initial=0.0)
     if fed > 0.0:
         names_of = [sources[i].name for i in ruled if every[i, n_x + n_s :].any()]

@@ -6,9 +6,9 @@ depend algebraically on x and s, are eliminated. Kirchhoff's current law on the 
 
     P^T i + K x + B s = 0,    i the currents of all capacitors with their leaks, s with the current sources' currents.
 
-The same law on the cuts of the voltage sources gives the currents that these deliver. Controlled sources and inductors count
-as sources first, and are then eliminated (`controlled`): P^T becomes another matrix than that of the voltages, and K is
-no longer symmetric.
+The same law on the cuts of the voltage sources gives the currents that these deliver. Controlled sources and inductors
+count as sources first, and are then eliminated (`controlled`): P^T becomes another matrix than that of the voltages,
+and K is no longer symmetric.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Network(Remembering):
     # p (n_cell, n), q (n_cell, n_s): u = p x + q s
     p: FloatArray
     q: FloatArray
-    cut: FloatArray  # (n_cell, n): The cells' currents enter the cuts by its transpose, which is p unless sources follow
+    cut: FloatArray  # (n_cell, n): The cells' currents enter the cuts by its transpose; p unless sources are controlled
     # k (n, n), b (n, n_s): Currents of resistors and current sources into the cuts of the live capacitors, S
     k: FloatArray
     b: FloatArray
@@ -80,8 +80,8 @@ class Network(Remembering):
     resistor_factor: FloatArray
     resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
-    # (n_node, n + n_s + n_inner or n_s): Node voltages from x, s and the inner sources, or the currents delivered, where
-    # controlled sources follow those
+    # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources; where they follow the currents that
+    # sources deliver (`senses`), from x, s and these
     nodes: FloatArray
     # The series stack if this is its network: modes and phasors are then computed from it, to full relative precision
     stack: Stack | None = None
@@ -155,7 +155,7 @@ class Network(Remembering):
     @cached_property
     def senses(self) -> bool:
         """Whether nodes' voltages follow currents that sources deliver."""
-        return self.nodes.shape[1] > sum(self.b.shape) + len(self.inner)
+        return bool(self.nodes.shape[1] > sum(self.b.shape) + len(self.inner))
 
     @cached_property
     def named_contacts(self) -> tuple[tuple[str, Contact], ...]:
@@ -326,7 +326,7 @@ def _closed(network: Network, circuit: Circuit) -> Network:
     made = closed(found, sources, network.node_names, circuit.by_device("K"), between)
     own, states, n_all = [i for i, e in enumerate(sources) if e.device in "VI"], len(made.flux), network.n_voltage
     alike = np.pad(network.resistor_factor, ((0, 0), (0, states)))
-    through = (Cell(e, e.nodes, None, between, 0.0, 0.0) for e in coils[:states])
+    through = (Cell(e, (e.nodes[0], e.nodes[1]), None, between, 0.0, 0.0) for e in coils[:states])
     out = replace(
         network, **made.matrices._asdict(), sources=tuple(sources[i] for i in own),
         n_voltage=sum(sources[i].device == "V" for i in own), cells=(*network.cells, *through),

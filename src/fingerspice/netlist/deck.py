@@ -27,6 +27,7 @@ MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
+_LETTERS = [name for name, spec in DEVICES.items() if spec.cells is None]  #: Elements with a letter of their own.
 #: Forms of a controlled source that follows otherwise than in proportion, by the word after its nodes.
 NONLINEAR = ("POLY", "VALUE", "TABLE", "LAPLACE", "FREQ", "CHEBYSHEV", "VOL", "CUR")
 
@@ -119,9 +120,11 @@ class _Instance:
         first = lexemes[0]
         where, letter = first.where, first.text[:1].upper()
         if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
-            problem = f"'{first.written}' is no element: a line begins with R, C, L, V, I, E, F, G, H, K, X or a dot, a comment with *"
-            raise InputError(problem, where)
-        if letter != "X" and letter not in DEVICES:
+            begins = f"a line begins with {', '.join(_LETTERS)}, X or a dot, a comment with *"
+            raise InputError(f"'{first.written}' is no element: {begins}", where)
+        # A device's name without its X may begin with the letter of an element.
+        called = letter in "LKEGFH" and any(x.kind == "=" for x in lexemes) and _calls(lexemes)
+        if letter != "X" and (letter not in DEVICES or called):
             raise InputError(_unknown_element(lexemes), where)
         name = f"{self.prefix}{first.text}"
         if len(name) > MAX_NAME:
@@ -233,13 +236,20 @@ def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
     return f"'{last.text}' is not a device or a .subckt{hint}"
 
 
+def _calls(lexemes: list[Lexeme]) -> bool:
+    """Whether a line has the name of a device behind its nodes."""
+    return any(lexeme.text.upper() in called_devices() for lexeme in lexemes[3:])
+
+
 def _unknown_element(lexemes: list[Lexeme]) -> str:
     """The message that a line with these words is not an element, with a hint."""
     name = lexemes[0].text
-    if any(lexeme.text.upper() in called_devices() for lexeme in lexemes[3:]):
+    if _calls(lexemes):
         return f"'{name}': a device's name begins with X, as in X{name}"
     if f".{name.lower()}" in DIRECTIVES:
         return f"'{name}': a directive begins with a dot, as in .{name.lower()}"
     kind = OTHERS["elements"].get(name[0].upper())
+    kind, _, instead = (kind or "").partition("; ")
     what = f"'{name}' is {kind}, which is not supported" if kind else f"'{name}' is no known element"
-    return f"{what}; elements are R, C, L, K, V, I, E, F, G, H, and X with {', '.join(called_devices())} or a .subckt"
+    what += f": {instead}" if instead else ""
+    return f"{what}; elements are {', '.join(_LETTERS)}, and X with {', '.join(called_devices())} or a .subckt"

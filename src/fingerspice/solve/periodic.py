@@ -440,8 +440,8 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Period]:
     """
     if problem.network.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    refuse(problem.network.active, "a periodic state is found by modes that decay without oscillation, and this circuit "
-           "has inductors or amplifiers; allowed: a run of more periods, and phasor")  # fmt: skip
+    needed = "a periodic state is found by modes that decay without oscillation, and this circuit has inductors or"
+    refuse(problem.network.active, f"{needed} amplifiers; allowed: a run of more periods, and phasor")
     period = Search(problem, rtol) if problem.scene.coupled else Period(problem)
     period.close()
     y, moved = np.append(period.start, np.zeros(period.before.size)), period.begin - problem.t_start

@@ -272,15 +272,15 @@ def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
         return "linear", f"{which if scene.fixed else 'no element has an area'}, so the circuit is linear"
     if model is None:
         follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
-        if math.isnan(changed):
-            return "coupled", f"{follows}; by how much is not known beforehand: {unbounded(problem.network)} sets no bound"
+        if (free := unbounded(problem.network)) and math.isnan(changed):
+            return "coupled", f"{follows}; by how much is not known beforehand: {free} sets no bound"
         return "coupled", f"{follows}, {'each ' if several else ''}by up to {_percent(changed)} of its middle"
-    free = not model.rate0.any()
-    if model.mobile or not (free or changed <= 0.2 * rtol):
+    insulating = not model.rate0.any()
+    if model.mobile or not (insulating or changed <= 0.2 * rtol):
         return "coupled", f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
     if problem.charge:
         return "coupled", "only the charge needs the area at every instant; charge=False leaves it out"
-    if free:
+    if insulating:
         return "linear", "every leak scales with the area, so under the local law no voltage feels it"
     return "linear", f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
 
