@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import count, pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -30,6 +30,7 @@ from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.controlled import Matrices, closed
 from fingerspice.circuit.devices import PHASE_POLES, check
 from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of, find_branches, shared
+from fingerspice.circuit.switching import Course
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import layer_gains, settled_areas
@@ -89,6 +90,7 @@ class Network(Remembering):
     active: bool = False
     # (n_voltage,): Largest voltage of a controlled source over that of the source that it follows, or 1; empty for 1
     lift: tuple[float, ...] = ()
+    course: Course | None = None  # When switches change, which are as they are before time 0 here
     coils: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # As `Closed.flux`, of the last states
     # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
     kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
@@ -151,6 +153,19 @@ class Network(Remembering):
     def owned(self) -> bool:
         """Whether a GAP's own capacitance or leak follows its voltage otherwise than its ridge area does."""
         return any(area.own for area in self.areas)
+
+    def switched(self, on: tuple[bool, ...]) -> Network:
+        """This network with these switches on."""
+
+        def make() -> Network:
+            assert self.course is not None
+            other = build_network(replace(self.course.circuit, work="gap"), on=on)
+            alike = all(np.allclose(getattr(self, x), getattr(other, x), 1e-12, 1e-300) for x in ("p", "q", "cut"))
+            said = f"{self.course.switches[0].name} changes how a controlled source drives a capacitor"
+            refuse(not alike, f"{said}; allowed: an R between them", self.course.switches[0])
+            return other
+
+        return self.remember(("switched", on), make, 64)
 
     @cached_property
     def senses(self) -> bool:
@@ -249,10 +264,11 @@ class Network(Remembering):
         return complex(n - p)
 
 
-def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
+def build_network(circuit: Circuit, held: tuple[Element, ...] = (), on: tuple[bool, ...] | None = None) -> Network:
     """The network of a circuit, or its refusal.
 
     The voltage sources in `held` are added, to hold the voltages of nodes; they may close no loop of voltage sources.
+    Switches are as `on` says, by default as they are before time 0.
     """
     areas, carrying = find_branches(circuit)
     branches = [*carrying, *held]
@@ -261,7 +277,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     place = {area.node: i for i, area in enumerate(areas)}
     # The gaps come first, so that the tree contains them and their voltages are states.
     cells = sorted((cell for e in branches for cell in _cells(e, place)), key=lambda cell: cell.element.device != "GAP")
-    kinds = statespace.VOLTAGES, statespace.CURRENTS, "R"
+    kinds = statespace.VOLTAGES, statespace.CURRENTS, "RS"
     voltages, currents, resistors = ([e for x in kind for e in branches if e.device == x] for kind in kinds)
     n_v, n_i, n_c = len(voltages), len(currents), len(cells)
     ends = [*(e.nodes for e in voltages), *(cell.nodes for cell in cells), *(e.nodes for e in resistors)]
@@ -278,7 +294,8 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 
     across, over_currents = rows([cell.nodes for cell in cells])[:, order], rows([e.nodes for e in currents])
     over_e, over_r = np.hsplit(rows([e.nodes for e in resistors]), [n_e])
-    conductance = np.array([1.0 / e.values["value"] for e in resistors])[:, None]
+    course = Course(circuit) if any(e.device == "S" for e in resistors) else None
+    conductance = 1.0 / np.array([_resistance(e, course, on) for e in resistors])[:, None]
     weight = np.sqrt(conductance)
     # Given e = (s, x), the voltages r minimise the power.
     orthogonal, upper = np.linalg.qr(weight * over_r)
@@ -312,7 +329,17 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
         node_names=tuple(written[name] for name in names),
         nodes=np.hstack([(at_e + at_r @ from_e)[:, order], at_r @ from_i]),
     )  # fmt: skip
-    return network if all(e.device in "VI" for e in network.sources) else _closed(network, circuit)
+    ideal = all(e.device in "VI" for e in network.sources)
+    network = network if ideal else _closed(network, circuit)
+    return network if course is None else replace(network, active=True, course=course)
+
+
+def _resistance(element: Element, course: Course | None, on: tuple[bool, ...] | None) -> float:
+    """Resistance of an R, or of a switch in its state, ohm."""
+    if course is None or element.device == "R":
+        return element.values["value"]
+    closed = dict(zip((e.name for e in course.switches), on or course.changes(0.0)[1][0], strict=True))
+    return element.values["ron" if closed[element.name] else "roff"]
 
 
 def _closed(network: Network, circuit: Circuit) -> Network:
@@ -333,7 +360,7 @@ def _closed(network: Network, circuit: Circuit) -> Network:
         live=(*network.live, *range(len(network.cells), len(network.cells) + states)),
         resistor_factor=alike, resistor_factor_s=network.resistor_factor_s @ made.sources,
         active=not made.reciprocal, coils=made.flux,
-        lift=tuple(np.abs(made.sources[:n_all, : len(own)]).max(axis=0, initial=1.0).tolist()),
+        kept={}, lift=tuple(np.abs(made.sources[:n_all, : len(own)]).max(axis=0, initial=1.0).tolist()),
     )  # fmt: skip
     mass = out.cut.T @ (out.capacitance(out.areas_at_rest)[:, None] * out.p)
     size = np.abs(out.cut).T @ (out.capacitance(out.areas_at_rest)[:, None] * np.abs(out.p))
@@ -416,7 +443,9 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
 
     def make() -> Network:
         if statespace.loop_of(circuit) is None:
-            network = shared(circuit, ("network",), lambda: build_network(circuit))
+            # Switches follow the sources, in which networks that are shared may differ.
+            keeper = circuit.remember if circuit.by_device("S") else partial(shared, circuit)
+            network = keeper(("reduced",), lambda: build_network(circuit))
             now = {e.name: e for e in circuit.elements}
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
         stack = build_stack(circuit, skin_at)

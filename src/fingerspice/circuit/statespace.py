@@ -187,7 +187,7 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
         first = owners.setdefault(gap.nodes[2], gap)
         both = f"{first.name} and {gap.name} both drive the area node {gap.node_names[2]!r}"
         refuse(first is not gap, f"{both}; allowed: one GAP per area", gap)
-    at = _incidence(list(circuit.by_device(*"VIRCLEGFH")))
+    at = _incidence(list(circuit.by_device(*"VIRCLEGFHS")))
     out = []
     for node, layer in {e.nodes[2]: e for e in reversed(layers)}.items():
         on_node = list({id(e): e for e in at.get(node, ())}.values())

@@ -123,7 +123,7 @@ class _Instance:
             begins = f"a line begins with {', '.join(_LETTERS)}, X or a dot, a comment with *"
             raise InputError(f"'{first.written}' is no element: {begins}", where)
         # A device's name without its X may begin with the letter of an element.
-        called = letter in "LKEGFH" and any(x.kind == "=" for x in lexemes) and _calls(lexemes)
+        called = letter in "LKEGFHS" and any(x.kind == "=" for x in lexemes) and _calls(lexemes)
         if letter != "X" and (letter not in DEVICES or called):
             raise InputError(_unknown_element(lexemes), where)
         name = f"{self.prefix}{first.text}"
@@ -141,10 +141,10 @@ class _Instance:
         count = max(len(form), len(words.words) - 1) if letter == "K" else len(form)
         heads = [word for word in words.words[:count] if isinstance(word, Lexeme)]
         other = [x.text for x in lexemes[3:4] if spec.control and x.text.upper() in NONLINEAR]
-        written_so = f"{'an' if spec.what[0] in 'aeiou' else 'a'} {spec.what} is written {name} {' '.join(form)} value"
+        written_so = f"{'an' if spec.what[0] in 'aeiou' else 'a'} {spec.what} is written {name} {' '.join(form)} {'model' if letter == 'S' else 'value'}"
         refuse(other, f"{name} is given by {other and other[0]}: {written_so}, and follows in proportion only", where)
         missing = form[len(heads)] if len(heads) < len(form) else ""
-        missing = missing or ("" if len(words.words) > count or words.params else "value")
+        missing = missing or ("" if len(words.words) > count or words.params else written_so.rpartition(" ")[2])
         refuse(missing, f"missing {missing}: {written_so}", where)
         found = self.nodes(heads[: len(spec.nodes)])
         canonical, written = tuple(x for x, _ in found), tuple(x for _, x in found)
@@ -153,7 +153,7 @@ class _Instance:
             f"{self.prefix}{x.text}".lower() for x in rest
         )  # fmt: skip
         # A word of a source is a keyword (DC, SIN), that of any other element names a parameter.
-        bare: Bare = "nothing" if letter in "VI" else "name"
+        bare: Bare = "nothing" if letter in "VIS" else "name"
         body, params = scope.words(words.words[count:], bare), scope.pairs(words, bare)
         self.deck.statements.append(Statement(name, letter, canonical, written, body, params, where, control))
 

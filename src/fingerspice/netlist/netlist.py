@@ -86,7 +86,8 @@ def _circuit(deck: Deck) -> Circuit:
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:
     tran = next((read_tran(directive, notes) for directive in deck.directives[".tran"]), None)
-    context = Context(tran, None if deck.path is None else deck.path.parent)
+    models = read_models(deck.directives[".model"])
+    context = Context(tran, None if deck.path is None else deck.path.parent, models=models)
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.directives[".options"])
     initial, unused_starts = read_start(deck.directives[".ic"], elements, tran is None or tran.uic)
@@ -168,6 +169,8 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
     values: dict[str, float] = {}
     if device in "VI":
         read["waveform"], read["ac"] = read_source(own, context, notes)
+    elif device == "S":
+        values = _device_values(_modelled(own, context), None, notes)
     elif DEVICES[device].cells is None:
         values, read["initial"] = _read_passive(own, notes)
     else:
@@ -193,6 +196,30 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
             out[0] = replace(element, nodes=(inner, nodes[1]), node_names=(written, names[1]))
         out.append(Element(written, kind, ends, ends_written, value, where=where))
     return out
+
+
+def read_models(directives: list[Call]) -> dict[str, Call]:
+    """``.model NAME SW(key=value ...)``, brackets or not: the type with its parameters by name in lower case."""
+    out: dict[str, Call] = {}
+    for one in directives:
+        name, kind = (*one.args, None, None)[:2]
+        usage = "allowed: .model NAME SW(Ron=1 Roff=1meg Vt=2.5 Vh=0)"
+        known = isinstance(name, Token) and kind is not None and len(one.args) == 2 and kind.text.upper() == "SW"
+        if not known or not isinstance(name, Token):
+            raise InputError(f"{one.line.strip()!r} is not supported; {usage}", one.where)
+        refuse(name.text.lower() in out, f".model {name.text} is given twice", one)
+        out[name.text.lower()] = Call("SW", (), kind.params if isinstance(kind, Call) else one.params, one.where)
+    return out
+
+
+def _modelled(statement: Statement, context: Context) -> Statement:
+    """The statement of a switch with the parameters of the model that it names."""
+    name, words = statement.name, [word.text for word in statement.body]
+    off = len(words) == 2 and words[1].lower() == "off"
+    refuse(statement.params or not (len(words) == 1 or off), f"{name} needs the name of a .model, and no more", statement)
+    hint = nearest(words[0], context.models) or ""
+    refuse(words[0].lower() not in context.models, f"{name} names the .model {words[0]!r}, which is missing{hint}", statement)
+    return statement._replace(params=context.models[words[0].lower()].params)
 
 
 def _law(statement: Statement) -> ContactLaw | None:

@@ -95,6 +95,7 @@ class Context:
     tran: Tran | None  # On whose times SPICE's defaults depend
     folder: Path | None = None  # Folder of the deck; None for a deck given as text
     in_deck: bool = True  # Whether the source stands in a deck, which a SPICE may read, too
+    models: Mapping[str, Call] = field(default_factory=dict)  # By name in lower case
     anywhere: bool = False  # Whether any file may be read, relative to the working directory: for a user's own sources
     size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
 
@@ -189,7 +190,7 @@ MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
 _USED = (
-    ".tran", ".ac", ".meas", ".measure", ".four", ".options", ".ic", ".param", ".func", ".global", ".subckt", ".ends",
+    ".tran", ".ac", ".meas", ".measure", ".four", ".options", ".ic", ".model", ".param", ".func", ".global", ".subckt", ".ends",
     ".include", ".inc", ".lib", ".endl", ".control", ".end",
 )  # fmt: skip
 _UNUSED = (".print", ".plot", ".save", ".probe", ".title")
@@ -318,7 +319,7 @@ class Deck:
         """Do what a directive asks for, whose arguments begin at a position of its line."""
         here, place, text = self._open[-1], line.where(), line.text[rest:]
         match name:
-            case ".tran" | ".ac" | ".option" | ".options" | ".ic":
+            case ".tran" | ".ac" | ".option" | ".options" | ".ic" | ".model":
                 opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
                 refuse(here is not self.root and name != ".ic", f"{name} does not belong inside {opened}?", place)
                 if name in (".tran", ".ac"):

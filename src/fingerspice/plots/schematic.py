@@ -161,7 +161,7 @@ Symbol = tuple[list[Stroke], float, float]  # Strokes of a symbol, half its heig
 _PARTS: dict[str, Symbol] = {
     "R": (_RESISTOR, _HALF, 0.08), "C": (_CAPACITOR, _HALF, 0.12),
     "V": (_CIRCLE + _PLUS_MINUS, _HALF, _RADIUS), "I": (_CIRCLE + _ARROW, _HALF, _RADIUS),
-    "L": (_COIL, _HALF, 0.08), **dict.fromkeys("EH", (_DIAMOND + _PLUS_MINUS, _HALF, _RADIUS)),
+    "S": ([[(0.0, _HALF), (0.0, 0.1)], [(0.0, -_HALF), (0.0, -0.1), (0.1, 0.08)]], _HALF, 0.1), "L": (_COIL, _HALF, 0.08), **dict.fromkeys("EH", (_DIAMOND + _PLUS_MINUS, _HALF, _RADIUS)),
     **dict.fromkeys("GF", (_DIAMOND + _ARROW, _HALF, _RADIUS)),
 }  # fmt: skip
 

@@ -411,6 +411,18 @@ class Record(Signals):
 
     @cached_property
     def node_voltages(self) -> dict[str, FloatArray]:  # type: ignore[override]
-        n = self._x.shape[1]
-        rows = zip(self.network.node_names, self.network.nodes, strict=True)
-        return {name: read_only(self._voltage(row[:n], row[n:])) for name, row in rows}
+        n, course, out = self._x.shape[1], self.network.course, dict[str, FloatArray]()
+        for name, row in zip(self.network.node_names, self.network.nodes, strict=True):
+            out[name] = read_only(self._voltage(row[:n], row[n:]))
+        if course is None or not self.t.size:
+            return out
+        times, on = course.changes(float(self.t.max()))
+        state = np.where(self.left, times.searchsorted(self.t), times.searchsorted(self.t, "right"))
+        kinds, which = np.unique(on, axis=0, return_inverse=True)
+        every = np.hstack([self._x, self._s])
+        networks = [self.network.switched(tuple(kind.tolist())) for kind in kinds]
+        values = np.zeros((self.t.size, len(out)))
+        for kind, network in enumerate(networks):
+            here = which.ravel()[state] == kind
+            values[here] = np.einsum("tc,nc->tn", every[here], network.nodes)
+        return {name: read_only(column) for name, column in zip(out, values.T.copy(), strict=True)}

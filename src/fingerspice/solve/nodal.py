@@ -106,6 +106,20 @@ class Collocation(Integration):
         )  # fmt: skip
 
     def through(self, sources: Sources, t_end: float) -> Status:
+        if (course := self.problem.network.course) is None:
+            return self.between(sources, t_end)
+        times, on = course.changes(self.problem.t_stop)
+        status, k = Status.SUCCESS, int(times.searchsorted(self.t, "right"))
+        while status is Status.SUCCESS and self.t < t_end:
+            self.net = self.problem.scene.switched(tuple(on[k].tolist()))
+            status = self.between(sources, min(t_end, float(times[k])) if k < times.size else t_end)
+            # The first step after a change is as long as that after the last one.
+            self.control[[implicit.H, implicit.JUMPED]] = self.control[implicit.H_AFTER_JUMP], 1.0
+            k += 1
+        return status
+
+    def between(self, sources: Sources, t_end: float) -> Status:
+        """As `through`, while no switch changes."""
         run = self.nodal(sources)
         while True:
             code = advance(run, t_end)
@@ -363,7 +377,7 @@ class Foreign(Collocation):
             raise _FailedError("torchdiffeq returned NaN")
         return states, count
 
-    def through(self, sources: Sources, t_end: float) -> Status:
+    def between(self, sources: Sources, t_end: float) -> Status:
         edges = np.unique(sources.edges)
         for stop in np.append(edges[(edges > self.t) & (edges < t_end)], t_end).tolist():
             after, _ = values_at(sources, self.t)

@@ -69,6 +69,10 @@ class Scene(Remembering):
         slow = np.where(tau > 0.0, np.cumsum(tau > 0.0) - 1, -1)
         return Net._make((self.charge_law == "mobile", *network.arrays, gap, area0, tau, slow, padded))
 
+    def switched(self, on: tuple[bool, ...]) -> Net:
+        """The equations with these switches on."""
+        return self.net._replace(**dict(zip(("k", "b", "through", "delivered"), self.network.switched(on).arrays[6:10], strict=True)))
+
     @property
     def shown(self) -> Scene:
         """The scene in whose form exponential steps record a stack: a voltage for each layer, not for each cell."""

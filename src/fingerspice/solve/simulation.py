@@ -224,7 +224,7 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     if chosen == "linear" and model is not None and scene.coupled and np.any(model.rate0 > 0.0):
         needed = changed
     if problem.network.active:
-        reasons.append("an inductor or an amplifier lets voltages oscillate or grow, which implicit steps take")
+        reasons.append("inductors, amplifiers or switches: voltages may oscillate or grow, which implicit steps take")
     if chosen == "coupled" and problem.network.owned:
         reasons.append("the gap's height, or its leak, follows its voltage, which implicit steps take")
     if scene.skin is not None:
@@ -266,7 +266,7 @@ def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
     if model is not None and not (model.rate.any() or model.rate0.any() or stores):
         return "algebraic", "no layer leaks, so the voltages follow the source at once"
     if not scene.coupled and problem.network.active:
-        return "coupled", "a network with inductors or amplifiers, whatever its areas"
+        return "coupled", "a network with inductors, amplifiers or switches, whatever its areas"
     if not scene.coupled:
         which = f"the area{' is' if model is not None else 's are'} {scene.area_mode}"
         return "linear", f"{which if scene.fixed else 'no element has an area'}, so the circuit is linear"
@@ -287,7 +287,7 @@ def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
 
 def unbounded(network: Network) -> str:
     """What keeps the sources' voltages from bounding those of a network; empty if nothing does."""
-    amplified = "an inductor or an amplifier" if network.active else ""
+    amplified = "an inductor, an amplifier or a switch" if network.active else ""
     return amplified or ("a current source" if len(network.sources) > network.n_voltage else "")
 
 
