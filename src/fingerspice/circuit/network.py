@@ -86,7 +86,7 @@ class Network(Remembering):
     nodes: FloatArray
     # The series stack if this is its network: modes and phasors are then computed from it, to full relative precision
     stack: Stack | None = None
-    # Whether modes may oscillate or grow, as with inductors and amplifiers: exponential steps do not take such networks
+    # Whether modes may oscillate, grow or change, with inductors, amplifiers and switches: not for exponential steps
     active: bool = False
     # (n_voltage,): Largest voltage of a controlled source over that of the source that it follows, or 1; empty for 1
     lift: tuple[float, ...] = ()
@@ -159,7 +159,7 @@ class Network(Remembering):
 
         def make() -> Network:
             assert self.course is not None
-            other = build_network(replace(self.course.circuit, work="gap"), on=on)
+            other = build_network(self.course.circuit, on=on)
             alike = all(np.allclose(getattr(self, x), getattr(other, x), 1e-12, 1e-300) for x in ("p", "q", "cut"))
             said = f"{self.course.switches[0].name} changes how a controlled source drives a capacitor"
             refuse(not alike, f"{said}; allowed: an R between them", self.course.switches[0])
@@ -329,9 +329,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = (), on: tuple[bo
         node_names=tuple(written[name] for name in names),
         nodes=np.hstack([(at_e + at_r @ from_e)[:, order], at_r @ from_i]),
     )  # fmt: skip
-    ideal = all(e.device in "VI" for e in network.sources)
-    network = network if ideal else _closed(network, circuit)
-    return network if course is None else replace(network, active=True, course=course)
+    return _closed(network if course is None else replace(network, active=True, course=course), circuit)
 
 
 def _resistance(element: Element, course: Course | None, on: tuple[bool, ...] | None) -> float:
@@ -343,8 +341,10 @@ def _resistance(element: Element, course: Course | None, on: tuple[bool, ...] | 
 
 
 def _closed(network: Network, circuit: Circuit) -> Network:
-    """The network with its controlled sources and inductors eliminated."""
+    """The network with its controlled sources and inductors eliminated, if it has any."""
     sources, coils = network.sources, [e for e in network.sources if e.device == "L"]
+    if all(e.device in "VI" for e in sources):
+        return network
     held = [c for c in network.capacitance(network.areas_at_rest).tolist() if c > 0.0]
     # Between the capacitors in size, so that errors of all states count alike; without any, from a resistor's time.
     widest = max((e.values["value"] for e in circuit.by_device("R")), default=1.0)
@@ -359,7 +359,7 @@ def _closed(network: Network, circuit: Circuit) -> Network:
         n_voltage=sum(sources[i].device == "V" for i in own), cells=(*network.cells, *through),
         live=(*network.live, *range(len(network.cells), len(network.cells) + states)),
         resistor_factor=alike, resistor_factor_s=network.resistor_factor_s @ made.sources,
-        active=not made.reciprocal, coils=made.flux,
+        active=network.active or not made.reciprocal, coils=made.flux,
         kept={}, lift=tuple(np.abs(made.sources[:n_all, : len(own)]).max(axis=0, initial=1.0).tolist()),
     )  # fmt: skip
     mass = out.cut.T @ (out.capacitance(out.areas_at_rest)[:, None] * out.p)

@@ -141,17 +141,17 @@ class _Instance:
         count = max(len(form), len(words.words) - 1) if letter == "K" else len(form)
         heads = [word for word in words.words[:count] if isinstance(word, Lexeme)]
         other = [x.text for x in lexemes[3:4] if spec.control and x.text.upper() in NONLINEAR]
-        written_so = f"{'an' if spec.what[0] in 'aeiou' else 'a'} {spec.what} is written {name} {' '.join(form)} {'model' if letter == 'S' else 'value'}"
+        article, last = "an" if spec.what[0] in "aeiou" else "a", "model" if letter == "S" else "value"
+        written_so = f"{article} {spec.what} is written {name} {' '.join(form)} {last}"
         refuse(other, f"{name} is given by {other and other[0]}: {written_so}, and follows in proportion only", where)
         missing = form[len(heads)] if len(heads) < len(form) else ""
-        missing = missing or ("" if len(words.words) > count or words.params else written_so.rpartition(" ")[2])
+        missing = missing or ("" if len(words.words) > count or words.params else last)
         refuse(missing, f"missing {missing}: {written_so}", where)
-        found = self.nodes(heads[: len(spec.nodes)])
+        found, rest = self.nodes(heads[: len(spec.nodes)]), heads[len(spec.nodes) :]
         canonical, written = tuple(x for x, _ in found), tuple(x for _, x in found)
-        rest = heads[len(spec.nodes) :]
-        control = tuple(x for x, _ in self.nodes(rest)) if "node" in spec.control else tuple(
-            f"{self.prefix}{x.text}".lower() for x in rest
-        )  # fmt: skip
+        # Nodes, or elements of the same subcircuit.
+        own = (f"{self.prefix}{x.text}".lower() for x in rest)
+        control = tuple(x for x, _ in self.nodes(rest)) if "node" in spec.control else tuple(own)
         # A word of a source is a keyword (DC, SIN), that of any other element names a parameter.
         bare: Bare = "nothing" if letter in "VIS" else "name"
         body, params = scope.words(words.words[count:], bare), scope.pairs(words, bare)

@@ -214,12 +214,12 @@ def read_models(directives: list[Call]) -> dict[str, Call]:
 
 def _modelled(statement: Statement, context: Context) -> Statement:
     """The statement of a switch with the parameters of the model that it names."""
-    name, words = statement.name, [word.text for word in statement.body]
-    off = len(words) == 2 and words[1].lower() == "off"
-    refuse(statement.params or not (len(words) == 1 or off), f"{name} needs the name of a .model, and no more", statement)
-    hint = nearest(words[0], context.models) or ""
-    refuse(words[0].lower() not in context.models, f"{name} names the .model {words[0]!r}, which is missing{hint}", statement)
-    return statement._replace(params=context.models[words[0].lower()].params)
+    words, known = [word.text for word in statement.body], context.models
+    plain = words[:1] and [x.lower() for x in words[1:]] in ([], ["off"]) and not statement.params
+    refuse(not plain, f"{statement.name} needs the name of a .model, and no more but OFF", statement)
+    missing = f"{statement.name} names the .model {words[0]!r}, which is missing{nearest(words[0], known) or ''}"
+    refuse(words[0].lower() not in known, missing, statement)
+    return statement._replace(params=known[words[0].lower()].params)
 
 
 def _law(statement: Statement) -> ContactLaw | None:

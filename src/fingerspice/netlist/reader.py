@@ -190,8 +190,8 @@ MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
 _USED = (
-    ".tran", ".ac", ".meas", ".measure", ".four", ".options", ".ic", ".model", ".param", ".func", ".global", ".subckt", ".ends",
-    ".include", ".inc", ".lib", ".endl", ".control", ".end",
+    ".tran", ".ac", ".meas", ".measure", ".four", ".options", ".ic", ".param", ".func", ".global", ".subckt", ".ends",
+    ".include", ".inc", ".lib", ".endl", ".model", ".control", ".end",
 )  # fmt: skip
 _UNUSED = (".print", ".plot", ".save", ".probe", ".title")
 #: Every directive that may stand in a deck; `Deck._direct` says what is done with it.

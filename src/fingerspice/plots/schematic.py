@@ -153,6 +153,7 @@ _COIL: list[Stroke] = [
     [(float(0.06 * np.sin(a)), float(0.15 - 0.1 * k - 0.05 * (1.0 - np.cos(a)))) for k in range(3) for a in _HALF_TURN],
     *([(0.0, s * 0.15), (0.0, s * _HALF)] for s in (1.0, -1.0)),
 ]
+_SWITCH: list[Stroke] = [[(0.0, _HALF), (0.0, 0.1)], [(0.0, -_HALF), (0.0, -0.1), (0.1, 0.08)]]
 _DIAMOND: list[Stroke] = [
     [(0.0, _RADIUS), (_RADIUS, 0.0), (0.0, -_RADIUS), (-_RADIUS, 0.0), (0.0, _RADIUS)], *_CIRCLE[1:]
 ]  # fmt: skip
@@ -161,7 +162,8 @@ Symbol = tuple[list[Stroke], float, float]  # Strokes of a symbol, half its heig
 _PARTS: dict[str, Symbol] = {
     "R": (_RESISTOR, _HALF, 0.08), "C": (_CAPACITOR, _HALF, 0.12),
     "V": (_CIRCLE + _PLUS_MINUS, _HALF, _RADIUS), "I": (_CIRCLE + _ARROW, _HALF, _RADIUS),
-    "S": ([[(0.0, _HALF), (0.0, 0.1)], [(0.0, -_HALF), (0.0, -0.1), (0.1, 0.08)]], _HALF, 0.1), "L": (_COIL, _HALF, 0.08), **dict.fromkeys("EH", (_DIAMOND + _PLUS_MINUS, _HALF, _RADIUS)),
+    "L": (_COIL, _HALF, 0.08), "S": (_SWITCH, _HALF, 0.1),
+    **dict.fromkeys("EH", (_DIAMOND + _PLUS_MINUS, _HALF, _RADIUS)),
     **dict.fromkeys("GF", (_DIAMOND + _ARROW, _HALF, _RADIUS)),
 }  # fmt: skip
 

@@ -71,7 +71,9 @@ class Scene(Remembering):
 
     def switched(self, on: tuple[bool, ...]) -> Net:
         """The equations with these switches on."""
-        return self.net._replace(**dict(zip(("k", "b", "through", "delivered"), self.network.switched(on).arrays[6:10], strict=True)))
+        return self.net._replace(
+            **dict(zip(("k", "b", "through", "delivered"), self.network.switched(on).arrays[6:10], strict=True))
+        )
 
     @property
     def shown(self) -> Scene:
