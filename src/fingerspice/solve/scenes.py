@@ -71,9 +71,8 @@ class Scene(Remembering):
 
     def switched(self, on: tuple[bool, ...]) -> Net:
         """The equations with these switches on."""
-        return self.net._replace(
-            **dict(zip(("k", "b", "through", "delivered"), self.network.switched(on).arrays[6:10], strict=True))
-        )
+        k, b, through, delivered, _ = self.network.switched(on).arrays[6:]
+        return self.net._replace(k=k, b=b, through=through, delivered=delivered)
 
     @property
     def shown(self) -> Scene:
