@@ -240,7 +240,7 @@ def rows(heading: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in table.split("\n")[2:]]
 
 
-FINGER, FILM, TWO_FINGERS, CREEP, LTSPICE = DECKS = blocks_of("spice")
+FINGER, FILM, AMPLIFIER, TWO_FINGERS, CREEP, LTSPICE = DECKS = blocks_of("spice")
 
 
 def run(text: str) -> fs.Solution:
@@ -273,6 +273,14 @@ def test_a_current_charges_the_film_by_its_capacitance() -> None:
     np.testing.assert_allclose(solution.node_voltages["top"], slope * solution.t, rtol=0, atol=1e-4 * slope * 1e-3)
 
 
+def test_the_amplifier_and_its_transformer_have_their_gains() -> None:
+    solution = run(AMPLIFIER)
+    peaks = {node: float(np.abs(v[solution.t > 2e-3]).max()) for node, v in solution.node_voltages.items()}
+    assert peaks["out"] == pytest.approx(10.0 / math.hypot(1.0, 2.0 * math.pi * 1e3 * 1e5 * 100e-12), rel=1e-3)
+    assert peaks["sec"] / peaks["prim"] == pytest.approx(0.99 * 20.0, rel=0.1)
+    assert solution.method == "radau"
+
+
 def test_two_fingers_have_an_area_and_parameters_each() -> None:
     solution = run(TWO_FINGERS)
     np.testing.assert_allclose(solution.area[0], [area_at_rest(0.5), area_at_rest(0.2)], rtol=1e-12)
@@ -300,7 +308,7 @@ def test_a_deck_of_ltspice_runs_with_its_parasitics() -> None:
     assert solution.area[0] == pytest.approx(area_at_rest(0.5), rel=1e-12)
 
 
-@pytest.mark.parametrize("text", [FINGER, FILM, TWO_FINGERS, CREEP], ids=["finger", "film", "two fingers", "creep"])
+@pytest.mark.parametrize("text", [FINGER, FILM, AMPLIFIER, TWO_FINGERS, CREEP], ids=lambda text: text[:9])
 def test_the_other_decks_run_unchanged_in_ngspice(text: str) -> None:
     ours = run(text)
     nodes = [node for node in ours.node_voltages if "." not in node]
@@ -322,15 +330,16 @@ def test_the_table_of_parameters_is_that_of_the_devices() -> None:
     for device, entry in DEVICES.items():
         for spec in entry.parameters:
             default = "required" if spec.default is None else shown(spec.default, spec)
-            legal = (">= 0" if spec.may_be_zero else "> 0") + (" or inf" if spec.may_be_infinite else "")
+            legal = ("any" if spec.least < 0.0 else ">= 0" if spec.may_be_zero else "> 0") + (" or inf" if spec.may_be_infinite else "")
             assert spec.usual is not None
             usual = f"{shown(spec.usual.least, spec)} to {shown(spec.usual.most, spec)}"
             expected[device, f"`{spec.name}`"] = [spec.unit or "1", default, legal, usual]
     table = {(device, row[1]): row[2:6] for row in rows("device") for device in row[0].split(", ")}
     assert table == expected
     assert all(row[6] for row in rows("device"))
-    own = "f", "n_cpe", "r_exp"
-    others = {(s.least, s.most) for entry in DEVICES.values() for s in entry.parameters if s.name not in own}
+    own = "f", "n_cpe", "r_exp", "k"
+    every = [s for entry in DEVICES.values() for s in entry.parameters if s.name not in own]
+    others = {(abs(s.least) if s.least > 0.0 else 1e-30, s.most) for s in every}
     frequency = DEVICES["SKIN"].parameter("f")
     assert others == {(1e-30, 1e30)}
     assert (frequency.least, frequency.most) == (parse_number("1m"), parse_number("1g"))

@@ -65,10 +65,11 @@ class Element(Remembering):
     node_names: tuple[str, ...]  # As written
     values: Mapping[str, float]  # Value of every parameter of the device, in the netlist's unit
     waveform: Waveform | None = None  # Of a source
-    initial: float | None = None  # ``IC=`` of a capacitor, V
+    initial: float | None = None  # ``IC=`` of a capacitor, V, or of an inductor, A
     where: Where | None = None  # Place in the netlist
     ac: SmallSignal | None = None  # Of a source that has one
     law: ContactLaw | None = None  # Of a GAP with another one than the paper's
+    control: tuple[str, ...] = ()  # Nodes or elements that control it, in lower case
 
     def __repr__(self) -> str:
         from fingerspice.circuit.describe import values_text

@@ -69,7 +69,7 @@ def digests(circuit: Circuit) -> tuple[str, str]:
     for element in circuit.elements:
         wave = element.waveform
         elements.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
-        elements.update(law_digest(element).encode())
+        elements.update((law_digest(element) or " ".join(element.control)).encode())
         sources.update(repr((element.name, wave.digest() if isinstance(wave, Samples) else wave)).encode())
     elements.update(repr((dict(circuit.initial), tran and (tran.max_step, tran.uic))).encode())
     return elements.hexdigest(), sources.hexdigest()
@@ -156,8 +156,8 @@ def circuit_page(circuit: Circuit) -> Page:
     """The elements of a circuit and the analyses of its deck."""
     rows = []
     for e in circuit.elements[:_MOST_ELEMENTS]:
-        text = values_text(e)
-        rows.append((e.name, e.device, " ".join(e.node_names), text if len(text) <= 96 else f"{text[:92]} ..."))
+        text, nodes = values_text(e), " ".join((*e.node_names, *e.control))
+        rows.append((e.name, e.device, nodes, text if len(text) <= 96 else f"{text[:92]} ..."))
     table = Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4)
     more, tran, ac = len(circuit.elements) - len(rows), circuit.tran, circuit.ac
     lines: list[str | Table] = [heading(circuit), "", table, *([f"... and {more} more elements"] if more else []), ""]

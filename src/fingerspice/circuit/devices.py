@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit, Element
 
 # Units that take a prefix, where a slip of the user is a power of 1000; in the other units the slip is m^2 for mm^2.
-_PREFIXED = ("m", "N", "Pa", "ohm", "ohm m", "A", "V", "V/m", "F", "Hz", "s")
+_PREFIXED = ("m", "N", "Pa", "ohm", "ohm m", "A", "V", "V/m", "F", "H", "S", "Hz", "s")
 _THOUSANDS = tuple(sign * 3 * k for k in (1, 2, 3, 4, 5) for sign in (-1, 1))
 _MILLIONS = {"mm^2": (6, -6), "mm^2/N^m": (6, -6), "mm^4/N^2": (12, -12)}
 
@@ -113,6 +113,7 @@ class DeviceSpec:
     what: str = ""  # What it is, in few words, above its sliders
     aliases: tuple[str, ...] = ()  # Other names of the value
     beside: tuple[str, ...] = ()  # LTspice's parasitics, which become elements: rser in series, all others in parallel
+    control: tuple[str, ...] = ()  # What a line names after the nodes: nodes, or elements of that kind
     data: tuple[str, ...] = ()  # Data of a part that LTspice and Qucs-S write and no calculation uses
     place: int = 4  # Among the explorer's sliders
 

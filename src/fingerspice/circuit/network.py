@@ -6,14 +6,16 @@ depend algebraically on x and s, are eliminated. Kirchhoff's current law on the 
 
     P^T i + K x + B s = 0,    i the currents of all capacitors with their leaks, s with the current sources' currents.
 
-The same law on the cuts of the voltage sources gives the currents that these deliver.
+The same law on the cuts of the voltage sources gives the currents that these deliver. Controlled sources and inductors
+count as sources first, and are then eliminated (`controlled`): P^T becomes another matrix than that of the voltages,
+and K is no longer symmetric.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import count, pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -25,8 +27,10 @@ from fingerspice.base.arrays import ComplexArray, FloatArray, Remembering
 from fingerspice.base.errors import InputError
 from fingerspice.circuit import statespace
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.controlled import Matrices, closed
 from fingerspice.circuit.devices import PHASE_POLES, check
 from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of, find_branches, shared
+from fingerspice.circuit.switching import Course
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import layer_gains, settled_areas
@@ -64,6 +68,7 @@ class Network(Remembering):
     # p (n_cell, n), q (n_cell, n_s): u = p x + q s
     p: FloatArray
     q: FloatArray
+    cut: FloatArray  # (n_cell, n): The cells' currents enter the cuts by its transpose; p unless sources are controlled
     # k (n, n), b (n, n_s): Currents of resistors and current sources into the cuts of the live capacitors, S
     k: FloatArray
     b: FloatArray
@@ -76,9 +81,17 @@ class Network(Remembering):
     resistor_factor: FloatArray
     resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
-    nodes: FloatArray  # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources
+    # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources; where they follow the currents that
+    # sources deliver (`senses`), from x, s and these
+    nodes: FloatArray
     # The series stack if this is its network: modes and phasors are then computed from it, to full relative precision
     stack: Stack | None = None
+    # Whether modes may oscillate, grow or change, with inductors, amplifiers and switches: not for exponential steps
+    active: bool = False
+    # (n_voltage,): Largest voltage of a controlled source over that of the source that it follows, or 1; empty for 1
+    lift: tuple[float, ...] = ()
+    course: Course | None = None  # When switches change, which are as they are before time 0 here
+    coils: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # As `Closed.flux`, of the last states
     # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
     kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
@@ -121,7 +134,7 @@ class Network(Remembering):
         def make() -> tuple[Any, ...]:
             constants = np.array([(c.c, c.g_total, c.g_area) for c in self.cells], float).reshape(-1, 3).T.copy()
             place = np.array([-1 if c.area is None else c.area for c in self.cells], np.int64)
-            matrices = self.p, self.q, *constants, place, self.k, self.b, self.through, self.delivered
+            matrices = self.p, self.q, *constants, place, self.k, self.b, self.through, self.delivered, self.cut
             return tuple(map(np.ascontiguousarray, matrices))
 
         return self.remember(("arrays",), make)
@@ -140,6 +153,24 @@ class Network(Remembering):
     def owned(self) -> bool:
         """Whether a GAP's own capacitance or leak follows its voltage otherwise than its ridge area does."""
         return any(area.own for area in self.areas)
+
+    def switched(self, on: tuple[bool, ...]) -> Network:
+        """This network with these switches on."""
+
+        def make() -> Network:
+            assert self.course is not None
+            other = build_network(self.course.circuit, on=on)
+            alike = all(np.allclose(getattr(self, x), getattr(other, x), 1e-12, 1e-300) for x in ("p", "q", "cut"))
+            said = f"{self.course.switches[0].name} changes how a controlled source drives a capacitor"
+            refuse(not alike, f"{said}; allowed: an R between them", self.course.switches[0])
+            return other
+
+        return self.remember(("switched", on), make, 64)
+
+    @cached_property
+    def senses(self) -> bool:
+        """Whether nodes' voltages follow currents that sources deliver."""
+        return bool(self.nodes.shape[1] > sum(self.b.shape) + len(self.inner))
 
     @cached_property
     def named_contacts(self) -> tuple[tuple[str, Contact], ...]:
@@ -176,7 +207,12 @@ class Network(Remembering):
     def stiffness(self, y: ArrayLike) -> tuple[Any, Any]:
         """Matrices of the currents into the cuts from x (..., n, n) and s (..., n, n_s), S, at y (..., n_cell), S."""
         y = np.asarray(y)[..., None]
-        return self.k + self.p.T @ (y * self.p), self.b + self.p.T @ (y * self.q)
+        return self.k + self.cut.T @ (y * self.p), self.b + self.cut.T @ (y * self.q)
+
+    def decay(self, area: FloatArray) -> FloatArray:
+        """Real parts of the rates at which modes decay at areas (n_area,) in m^2, 1/s, negative where one grows."""
+        mass = self.cut.T @ (self.capacitance(area)[:, None] * self.p)
+        return np.asarray(np.linalg.eigvals(np.linalg.solve(mass, self.stiffness(self.leak(area))[0])).real)
 
     def admittances(self, frequency: ArrayLike, area: FloatArray) -> ComplexArray:
         """Complex admittance of every cell at frequencies (Hz), with SKIN's data there, S, shape (..., n_cell)."""
@@ -203,7 +239,10 @@ class Network(Remembering):
 
     def node_phasors(self, frequency: float, area: FloatArray, s: ComplexArray) -> ComplexArray:
         """Node voltages (n_node,) at a frequency (Hz) and areas (n_area,) in m^2 for source phasors s (n_s,)."""
-        both = np.concatenate([self._live(self.admittances(frequency, area), s), s])
+        y = self.admittances(frequency, area)
+        both = np.concatenate([x := self._live(y, s), s])
+        if self.senses:
+            both = np.append(both, self.through @ (y * (self.p @ x + self.q @ s)) + self.delivered @ both)
         return np.asarray(self.nodes[:, : both.size] @ both)
 
     def layer_gain(self, frequency: float, area: FloatArray) -> ComplexArray:
@@ -225,10 +264,11 @@ class Network(Remembering):
         return complex(n - p)
 
 
-def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
+def build_network(circuit: Circuit, held: tuple[Element, ...] = (), on: tuple[bool, ...] | None = None) -> Network:
     """The network of a circuit, or its refusal.
 
     The voltage sources in `held` are added, to hold the voltages of nodes; they may close no loop of voltage sources.
+    Switches are as `on` says, by default as they are before time 0.
     """
     areas, carrying = find_branches(circuit)
     branches = [*carrying, *held]
@@ -237,7 +277,8 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     place = {area.node: i for i, area in enumerate(areas)}
     # The gaps come first, so that the tree contains them and their voltages are states.
     cells = sorted((cell for e in branches for cell in _cells(e, place)), key=lambda cell: cell.element.device != "GAP")
-    voltages, currents, resistors = ([e for e in branches if e.device == device] for device in "VIR")
+    kinds = statespace.VOLTAGES, statespace.CURRENTS, "RS"
+    voltages, currents, resistors = ([e for x in kind for e in branches if e.device == x] for kind in kinds)
     n_v, n_i, n_c = len(voltages), len(currents), len(cells)
     ends = [*(e.nodes for e in voltages), *(cell.nodes for cell in cells), *(e.nodes for e in resistors)]
     taken, potential = statespace.spanning_tree(ends)
@@ -253,7 +294,8 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 
     across, over_currents = rows([cell.nodes for cell in cells])[:, order], rows([e.nodes for e in currents])
     over_e, over_r = np.hsplit(rows([e.nodes for e in resistors]), [n_e])
-    conductance = np.array([1.0 / e.values["value"] for e in resistors])[:, None]
+    course = Course(circuit) if any(e.device == "S" for e in resistors) else None
+    conductance = 1.0 / np.array([_resistance(e, course, on) for e in resistors])[:, None]
     weight = np.sqrt(conductance)
     # Given e = (s, x), the voltages r minimise the power.
     orthogonal, upper = np.linalg.qr(weight * over_r)
@@ -276,17 +318,58 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     written = {node: name for el in branches for node, name in zip(el.nodes, el.node_names, strict=True)}
     names = [node for node in potential if node in written and node != "0"]
     at_e, at_r = np.hsplit(rows([(name, "0") for name in names]), [n_e])
-    return Network(
+    network = Network(
         sources=(*voltages, *currents), n_voltage=n_v, cells=tuple(cells), live=tuple(live),
         layers=tuple(e for e in branches if e.spec.is_layer), areas=areas,
         contacts=tuple(map(_contact, areas)),
         gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
-        p=np.ascontiguousarray(across[:, :n]), q=np.hstack([across[:, n:], np.zeros((n_c, n_i))]),
+        p=(p := np.ascontiguousarray(across[:, :n])), q=np.hstack([across[:, n:], np.zeros((n_c, n_i))]), cut=p,
         k=into[n_v:, :n], b=into[n_v:, n:], through=through, delivered=delivered,
         resistor_factor=factor[:, :n], resistor_factor_s=np.hstack([factor[:, n:], np.zeros((len(resistors), n_i))]),
         node_names=tuple(written[name] for name in names),
         nodes=np.hstack([(at_e + at_r @ from_e)[:, order], at_r @ from_i]),
     )  # fmt: skip
+    return _closed(network if course is None else replace(network, active=True, course=course), circuit)
+
+
+def _resistance(element: Element, course: Course | None, on: tuple[bool, ...] | None) -> float:
+    """Resistance of an R, or of a switch in its state, ohm."""
+    if course is None or element.device == "R":
+        return element.values["value"]
+    closed = dict(zip((e.name for e in course.switches), on or course.changes(0.0)[1][0], strict=True))
+    return element.values["ron" if closed[element.name] else "roff"]
+
+
+def _closed(network: Network, circuit: Circuit) -> Network:
+    """The network with its controlled sources and inductors eliminated, if it has any."""
+    sources, coils = network.sources, [e for e in network.sources if e.device == "L"]
+    if all(e.device in "VI" for e in sources):
+        return network
+    held = [c for c in network.capacitance(network.areas_at_rest).tolist() if c > 0.0]
+    # Between the capacitors in size, so that errors of all states count alike; without any, from a resistor's time.
+    widest = max((e.values["value"] for e in circuit.by_device("R")), default=1.0)
+    between = math.sqrt(min(held) * max(held)) if held else max([e.values["value"] for e in coils] or [1.0]) / widest**2
+    found = Matrices(*(getattr(network, name) for name in Matrices._fields))
+    made = closed(found, sources, network.node_names, circuit.by_device("K"), between)
+    own, states, n_all = [i for i, e in enumerate(sources) if e.device in "VI"], len(made.flux), network.n_voltage
+    alike = np.pad(network.resistor_factor, ((0, 0), (0, states)))
+    through = (Cell(e, (e.nodes[0], e.nodes[1]), None, between, 0.0, 0.0) for e in coils[:states])
+    out = replace(
+        network, **made.matrices._asdict(), sources=tuple(sources[i] for i in own),
+        n_voltage=sum(sources[i].device == "V" for i in own), cells=(*network.cells, *through),
+        live=(*network.live, *range(len(network.cells), len(network.cells) + states)),
+        resistor_factor=alike, resistor_factor_s=network.resistor_factor_s @ made.sources,
+        active=network.active or not made.reciprocal, coils=made.flux,
+        kept={}, lift=tuple(np.abs(made.sources[:n_all, : len(own)]).max(axis=0, initial=1.0).tolist()),
+    )  # fmt: skip
+    mass = out.cut.T @ (out.capacitance(out.areas_at_rest)[:, None] * out.p)
+    size = np.abs(out.cut).T @ (out.capacitance(out.areas_at_rest)[:, None] * np.abs(out.p))
+    scale = 1.0 / np.sqrt(np.diag(size))
+    if mass.size and not np.linalg.det(scale[:, None] * mass * scale) > _ROUNDING:
+        named = [e for e in sources if e.device in "EGFH"]
+        said = f"behind {', '.join(e.name for e in named)} a node has no capacitance, or less than none"
+        raise InputError(f"{said}; allowed: less gain, or an R in series with the capacitor", named[0].where)
+    return out
 
 
 def _contact(area: Area) -> Contact | None:
@@ -360,7 +443,9 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
 
     def make() -> Network:
         if statespace.loop_of(circuit) is None:
-            network = shared(circuit, ("network",), lambda: build_network(circuit))
+            # Switches follow the sources, in which networks that are shared may differ.
+            keeper = circuit.remember if circuit.by_device("S") else partial(shared, circuit)
+            network = keeper(("reduced",), lambda: build_network(circuit))
             now = {e.name: e for e in circuit.elements}
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
         stack = build_stack(circuit, skin_at)
@@ -415,7 +500,7 @@ def loop_network(stack: Stack) -> Network:
         sources=(around,), n_voltage=1, cells=tuple(cells), layers=stack.layers, live=tuple(range(n)),
         areas=(Area(stack.layers[0].nodes[2], gap, stack.area_given),), contacts=(stack.contact,),
         gaps=(None if stack.gap is None else order.index(stack.gap),),
-        p=p, q=q, k=np.zeros((n, n)), b=np.zeros((n, 1)),
+        p=p, q=q, cut=p, k=np.zeros((n, n)), b=np.zeros((n, 1)),
         through=(sign * slowest)[None], delivered=np.zeros((1, n + 1)),
         resistor_factor=np.zeros((0, n)), resistor_factor_s=np.zeros((0, 1)),
         node_names=tuple(hop.node for hop in stack.hops[:-1]), nodes=nodes, stack=stack,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import operator
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
@@ -34,6 +34,8 @@ from fingerspice.waveforms.waveform import DC, OFF, Product, Sum, Waveform, refu
 
 MAX_ELEMENTS = 2000  #: Largest number of elements of a circuit, because every matrix of a network is dense.
 SLABS = len(SKIN_LADDER.poles) + 1  #: Number of slabs of a dispersive skin.
+#: Devices that set a voltage, and those that set a current, while the network is reduced.
+VOLTAGES, CURRENTS = "VEH", "IGFL"
 _GROUNDS = ("gnd", "ground", "earth", "vss")
 
 
@@ -61,15 +63,31 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
     counted = f", a SKIN_DISPERSIVE counted as its {SLABS} slabs" if count > len(circuit.elements) else ""
     refuse(count > MAX_ELEMENTS, f"the circuit has {count:,} elements{counted}; allowed: at most {MAX_ELEMENTS:,}")
     areas, drives = _areas(circuit), {e.name for e in driving(circuit)}
-    branches = [e for e in circuit.elements if e.device not in "VI" or e.name in drives]
+    branches = [e for e in circuit.elements if e.nodes and (e.device not in "VI" or e.name in drives)]
+    ruled = [e for e in circuit.elements if e.control]
     if not drives:
         allowed = "a V element that drives the stack, such as V1 drive 0 SIN(0 200 100), or a start, IC= of a capacitor"
         still = not circuit.initial and all(e.initial is None for e in branches)
         refuse(still, f"the circuit has no source; allowed: {allowed} or .ic v(node)=")
         nodes, names = branches[0].nodes[1::-1], branches[0].node_names[1::-1]  # In place of a source, one of 0 A.
         branches.append(Element("none", "I", nodes, names, MappingProxyType({}), OFF))
-    _refuse_unsolvable(branches)
+    if ruled:
+        _refuse_uncontrolled(ruled, branches)
+    _refuse_unsolvable(branches, {node for e in ruled if len(e.control) > 1 for node in e.control})
     return areas, branches
+
+
+def _refuse_uncontrolled(ruled: list[Element], branches: list[Element]) -> None:
+    """Refuse what is controlled by a node or an element that is not there."""
+    nodes = [*dict.fromkeys(node for e in branches for node in e.nodes), "0"]
+    for e in ruled:
+        kind = e.spec.control[0]
+        device, what = {"node": ("", "a node that some element touches"), "inductor": ("L", "an L element"),
+                        "source": ("V", "a V element, of 0 V where only its current counts")}[kind]  # fmt: skip
+        known = [one.name.lower() for one in branches if one.device == device] if device else nodes
+        for name in e.control:
+            near = "".join(f"; is {x!r} meant?" for x in get_close_matches(name, known, 1, 0.7))
+            refuse(name not in known, f"{e.name} names the {kind} {name!r}; allowed: {what}{near}", e)
 
 
 def driving(circuit: Circuit) -> list[Element]:
@@ -169,7 +187,7 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
         first = owners.setdefault(gap.nodes[2], gap)
         both = f"{first.name} and {gap.name} both drive the area node {gap.node_names[2]!r}"
         refuse(first is not gap, f"{both}; allowed: one GAP per area", gap)
-    at = _incidence(list(circuit.by_device("V", "I", "R", "C")))
+    at = _incidence(list(circuit.by_device(*"VIRCLEGFHS")))
     out = []
     for node, layer in {e.nodes[2]: e for e in reversed(layers)}.items():
         on_node = list({id(e): e for e in at.get(node, ())}.values())
@@ -258,8 +276,11 @@ def spanning_tree(branches: Iterable[tuple[str, ...]]) -> tuple[list[bool], dict
     return taken, {node: rows[node] for ends in tree for node in ends if node in rows}
 
 
-def _refuse_unsolvable(branches: list[Element]) -> None:
-    """Refuse what floats, loops of voltage sources, and current sources without a path for their current."""
+def _refuse_unsolvable(branches: list[Element], felt: Set[str] = frozenset()) -> None:
+    """Refuse what floats, loops of voltage sources, and current sources without a path for their current.
+
+    The nodes `felt` control sources: one that a voltage source sets needs no other element.
+    """
 
     def named(node: str, element: Element) -> str:
         return repr(element.node_names[element.nodes.index(node)])
@@ -269,7 +290,7 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
         refuse(e.nodes[0] == e.nodes[1], f"{e.name} has both ends on node {e.node_names[0]!r}", e)
     # Ground comes last: a chain not connected to ground also has a free end elsewhere, which is the node to name.
     for node, (e, *others) in sorted(at.items(), key=lambda item: item[0] == "0"):
-        if not others:
+        if not others and not (e.device in VOLTAGES and node in felt):
             # Ground under another name, or a node of which this one may be a misspelling
             near = get_close_matches(node, [other for other in at if other not in (node, "0")], 1, 0.7)
             hint = f"; is {named(near[0], at[near[0]][0])} the same node?" if near else ""
@@ -280,7 +301,7 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
     reached = _ways((e.nodes for e in branches), "0")
     for node, (e, *_) in at.items():
         refuse(node not in reached, f"node {named(node, e)} ({e.name}) is floating: nothing connects it to ground", e)
-    voltages = [e for e in branches if e.device == "V"]
+    voltages = [e for e in branches if e.device in VOLTAGES]
     taken, _ = spanning_tree(e.nodes for e in voltages)
     if not all(taken):
         # The sources before form no loop: there is one way through them from one end to the other.
@@ -291,11 +312,13 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
             names.append(before[number].name)
         refuse(len(names) == 1, f"{names[0]} and {e.name} are voltage sources in parallel", e)
         raise InputError(f"{e.name} closes a loop of voltage sources with {', '.join(names)}", e.where)
-    reached = _ways((e.nodes for e in branches if e.device != "I"), "0")
-    for source, node in ((e, node) for e in branches if e.device == "I" for node in e.nodes[:2]):
+    reached = _ways((e.nodes for e in branches if e.device not in CURRENTS), "0")
+    coils = any(e.device == "L" for e in branches)
+    for source, node in ((e, node) for e in branches if e.device in CURRENTS for node in e.nodes[:2]):
         if node not in reached:
-            where = f"node {named(node, source)} is reached through current sources only"
-            problem = f"{source.name} is a current source without a path: {where}; allowed: an R, C or layer that takes"
+            where = f"node {named(node, source)} is reached through current sources {'and inductors ' * coils}only"
+            kind = "an inductor" if source.device == "L" else "a current source"
+            problem = f"{source.name} is {kind} without a path: {where}; allowed: an R, C or layer that takes"
             raise InputError(f"{problem} the current to ground", source.where)
 
 

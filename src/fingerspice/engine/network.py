@@ -87,6 +87,7 @@ class Net(NamedTuple):
     # through, delivered (n_s, n_cell)
     through: FloatArray
     delivered: FloatArray
+    cut: FloatArray  # (n_cell, n): The cells' currents enter the cuts by its transpose; p, but for controlled sources
     gap: IntArray  # (n_area,): The cell whose voltage the area follows, -1 where it is fixed
     area0: FloatArray  # (n_area,): The fixed area, or the one at 0 V, m^2
     tau: FloatArray  # (n_area,): Time constant of the area, s; 0 where it follows at once
@@ -250,7 +251,7 @@ def residual(net: Net, room: Room, jump: bool, y: FloatArray, sign: FloatArray, 
         if net.mobile and i >= 0 and net.gap[i] >= 0:
             current += net.c[cell] * room.u[cell] * (room.rate[i] + room.slope[i] * room.along[net.gap[i]])
         for j in range(n):
-            out[j] -= net.p[cell, j] * current
+            out[j] -= net.cut[cell, j] * current
         for j in range(n_s):
             out[n + slow + j] += net.through[j, cell] * current
 
@@ -273,7 +274,7 @@ def capacitances(net: Net, room: Room, y: FloatArray, sign: FloatArray) -> None:
         if net.mobile and i >= 0 and net.gap[i] >= 0:
             felt, gap = net.c[cell] * room.u[cell] * room.slope[i], net.gap[i]
         for j in range(n):
-            share = net.p[cell, j]
+            share = net.cut[cell, j]
             if share != 0.0:
                 for k in range(n):
                     room.matrix[j, k] += share * (held * net.p[cell, k] + felt * net.p[gap, k])

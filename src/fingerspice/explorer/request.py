@@ -70,7 +70,7 @@ def value_text(value: float, unit: str) -> str:
 
 def _of_parameter(spec: ParameterSpec, value: float) -> tuple[float, float, bool]:
     """Ends of a device parameter's slider, and whether it is logarithmic."""
-    if spec.usual is None:  # Of a contact law
+    if spec.usual is None or spec.least < 0.0:  # Of a contact law, or a gain
         return min(0.0, 5.0 * value), max(0.0, 5.0 * value) or 1.0, False
     least, most = spec.usual.least, spec.usual.most
     if not math.isfinite(value):

@@ -28,8 +28,12 @@ MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
+_LETTERS = [name for name, spec in DEVICES.items() if spec.cells is None]  #: Elements with a letter of their own.
+#: Forms of a controlled source that follows otherwise than in proportion, by the word after its nodes.
+NONLINEAR = ("POLY", "VALUE", "TABLE", "LAPLACE", "FREQ", "CHEBYSHEV", "VOL", "CUR")
+
 _STATEMENT = re.compile(  #: Titles that are probably the netlist's first statement.
-    rf"[rcvi]\w*\s+\S+\s+\S+\s+(?:\{{|'|[-+.\d]|(?:dc|ac|sine|{'|'.join(SOURCES)})\b)"
+    rf"[rclvi]\w*\s+\S+\s+\S+\s+(?:\{{|'|[-+.\d]|(?:dc|ac|sine|{'|'.join(SOURCES)})\b)"
     rf"|(?:x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(called_devices())})|{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
     re.IGNORECASE,
 )
@@ -120,9 +124,11 @@ class _Instance:
         first = lexemes[0]
         where, letter = first.where, first.text[:1].upper()
         if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
-            problem = f"'{first.written}' is no element: a line begins with R, C, V, I, X or a dot, a comment with *"
-            raise InputError(problem, where)
-        if letter != "X" and letter not in DEVICES:
+            begins = f"a line begins with {', '.join(_LETTERS)}, X or a dot, a comment with *"
+            raise InputError(f"'{first.written}' is no element: {begins}", where)
+        # A device's name without its X may begin with the letter of an element.
+        called = letter in "LKEGFHS" and any(x.kind == "=" for x in lexemes) and _calls(lexemes)
+        if letter != "X" and (letter not in DEVICES or called):
             raise InputError(_unknown_element(lexemes), where)
         name = f"{self.prefix}{first.text}"
         if len(name) > MAX_NAME:
@@ -132,15 +138,28 @@ class _Instance:
         if letter == "X":
             self._call(name, lexemes)
             return
-        scope, words = self.scope, group(lexemes[1:], plain=2)
-        nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
-        missing = "node" if len(nodes) < 2 else "" if len(words.words) > 2 or words.params else "value"
-        refuse(missing, f"missing {missing}: a {DEVICES[letter].what} is written {name} node node value", where)
-        canonical, written = zip(*self.nodes(nodes), strict=True)
-        # A word of a resistor or capacitor names a parameter, those of a source are keywords (DC, SIN).
-        bare: Bare = "name" if letter in "RC" else "nothing"
-        body, params = scope.words(words.words[2:], bare), scope.pairs(words, bare)
-        self.deck.statements.append(Statement(name, letter, canonical, written, body, params, where))
+        spec = DEVICES[letter]
+        form = ["node"] * len(spec.nodes) + [*spec.control]
+        scope, words = self.scope, group(lexemes[1:], plain=len(form))
+        # A coupling may be one of more than two inductors.
+        count = max(len(form), len(words.words) - 1) if letter == "K" else len(form)
+        heads = [word for word in words.words[:count] if isinstance(word, Lexeme)]
+        other = [x.text for x in lexemes[3:4] if spec.control and x.text.upper() in NONLINEAR]
+        article, last = "an" if spec.what[0] in "aeiou" else "a", "model" if letter == "S" else "value"
+        written_so = f"{article} {spec.what} is written {name} {' '.join(form)} {last}"
+        refuse(other, f"{name} is given by {other and other[0]}: {written_so}, and follows in proportion only", where)
+        missing = form[len(heads)] if len(heads) < len(form) else ""
+        missing = missing or ("" if len(words.words) > count or words.params else last)
+        refuse(missing, f"missing {missing}: {written_so}", where)
+        found, rest = self.nodes(heads[: len(spec.nodes)]), heads[len(spec.nodes) :]
+        canonical, written = tuple(x for x, _ in found), tuple(x for _, x in found)
+        # Nodes, or elements of the same subcircuit.
+        own = (f"{self.prefix}{x.text}".lower() for x in rest)
+        control = tuple(x for x, _ in self.nodes(rest)) if "node" in spec.control else tuple(own)
+        # A word of a source is a keyword (DC, SIN), that of any other element names a parameter.
+        bare: Bare = "nothing" if letter in "VIS" else "name"
+        body, params = scope.words(words.words[count:], bare), scope.pairs(words, bare)
+        self.deck.statements.append(Statement(name, letter, canonical, written, body, params, where, control))
 
     def _call(self, name: str, lexemes: list[Lexeme]) -> None:
         """An X line: a native device becomes a statement, and a subcircuit is expanded."""
@@ -221,13 +240,20 @@ def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
     return f"'{last.text}' is not a device or a .subckt{hint}"
 
 
+def _calls(lexemes: list[Lexeme]) -> bool:
+    """Whether a line has the name of a device behind its nodes."""
+    return any(lexeme.text.upper() in called_devices() for lexeme in lexemes[3:])
+
+
 def _unknown_element(lexemes: list[Lexeme]) -> str:
     """The message that a line with these words is not an element, with a hint."""
     name = lexemes[0].text
-    if any(lexeme.text.upper() in called_devices() for lexeme in lexemes[3:]):
+    if _calls(lexemes):
         return f"'{name}': a device's name begins with X, as in X{name}"
     if f".{name.lower()}" in DIRECTIVES:
         return f"'{name}': a directive begins with a dot, as in .{name.lower()}"
     kind = OTHERS["elements"].get(name[0].upper())
+    kind, _, instead = (kind or "").partition("; ")
     what = f"'{name}' is {kind}, which is not supported" if kind else f"'{name}' is no known element"
-    return f"{what}; elements are R, C, V, I, and X with {', '.join(called_devices())} or a .subckt"
+    what += f": {instead}" if instead else ""
+    return f"{what}; elements are {', '.join(_LETTERS)}, and X with {', '.join(called_devices())} or a .subckt"

@@ -86,7 +86,8 @@ def _circuit(deck: Deck) -> Circuit:
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:
     tran = next((read_tran(directive, notes) for directive in deck.directives[".tran"]), None)
-    context = Context(tran, None if deck.path is None else deck.path.parent)
+    models = read_models(deck.directives[".model"])
+    context = Context(tran, None if deck.path is None else deck.path.parent, models=models)
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.directives[".options"])
     initial, unused_starts = read_start(deck.directives[".ic"], elements, tran is None or tran.uic)
@@ -205,14 +206,16 @@ def sweep_from_text(text: str) -> AcSweep:
 
 def read_elements(statement: Statement, context: Context, notes: list[str]) -> list[Element]:
     """The element of a statement, and those for LTspice's ``Rser``, ``Rpar`` and ``Cpar``; `notes` gets warnings."""
-    name, device, nodes, names, _, params, where = statement
+    name, device, nodes, names, _, params, where, control = statement
     beside = {key: params[key] for key in DEVICES[device].beside if key in params}
     own = statement._replace(params={k: v for k, v in params.items() if k not in beside})
-    read: dict[str, Any] = {}
+    read: dict[str, Any] = {"control": control} if control else {}
     values: dict[str, float] = {}
     if device in "VI":
         read["waveform"], read["ac"] = read_source(own, context, notes)
-    elif device in "RC":
+    elif device == "S":
+        values = _device_values(_modelled(own, context), None, notes)
+    elif DEVICES[device].cells is None:
         values, read["initial"] = _read_passive(own, notes)
     else:
         if device == "GAP" and "law" in own.params:
@@ -220,7 +223,7 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
         values = _device_values(own, read.get("law"), notes)
     element = Element(name, device, nodes, names, MappingProxyType(values), where=where, **read)
     for parameter, text in unusual(element):
-        given = statement.body[0] if parameter == "value" and statement.body else params.get(parameter)
+        given = statement.body[0] if statement.body else params.get(parameter)
         # One warning per number is enough.
         if not (isinstance(given, Number) and any(_doubts(given, element.spec.parameter(parameter)))):
             notes.append(f"{where if given is None else given.where}: {text}")
@@ -237,6 +240,30 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
             out[0] = replace(element, nodes=(inner, nodes[1]), node_names=(written, names[1]))
         out.append(Element(written, kind, ends, ends_written, value, where=where))
     return out
+
+
+def read_models(directives: list[Call]) -> dict[str, Call]:
+    """``.model NAME SW(key=value ...)``, brackets or not: the type with its parameters by name in lower case."""
+    out: dict[str, Call] = {}
+    for one in directives:
+        name, kind = (*one.args, None, None)[:2]
+        usage = "allowed: .model NAME SW(Ron=1 Roff=1meg Vt=2.5 Vh=0)"
+        known = isinstance(name, Token) and kind is not None and len(one.args) == 2 and kind.text.upper() == "SW"
+        if not known or not isinstance(name, Token):
+            raise InputError(f"{one.line.strip()!r} is not supported; {usage}", one.where)
+        refuse(name.text.lower() in out, f".model {name.text} is given twice", one)
+        out[name.text.lower()] = Call("SW", (), kind.params if isinstance(kind, Call) else one.params, one.where)
+    return out
+
+
+def _modelled(statement: Statement, context: Context) -> Statement:
+    """The statement of a switch with the parameters of the model that it names."""
+    words, known = [word.text for word in statement.body], context.models
+    plain = words[:1] and [x.lower() for x in words[1:]] in ([], ["off"]) and not statement.params
+    refuse(not plain, f"{statement.name} needs the name of a .model, and no more but OFF", statement)
+    missing = f"{statement.name} names the .model {words[0]!r}, which is missing{nearest(words[0], known) or ''}"
+    refuse(words[0].lower() not in known, missing, statement)
+    return statement._replace(params=known[words[0].lower()].params)
 
 
 def _law(statement: Statement) -> ContactLaw | None:
@@ -273,24 +300,26 @@ def _device_values(statement: Statement, law: ContactLaw | None, notes: list[str
 
 
 def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
-    """Value of an R or C, and the start voltage (V) of a C."""
+    """The one value of an element, and the start voltage (V) of a C or current (A) of an L."""
     name, device, params = statement.name, statement.device, statement.params
-    kind, spec = DEVICES[device], DEVICES[device].parameter("value")
-    own = (*kind.aliases, _COPIES, *(("ic",) if device == "C" else ()), *kind.data)
+    kind, (spec,) = DEVICES[device], DEVICES[device].parameters
+    copied = (_COPIES,) if device in "RCL" else ()
+    own = (*kind.aliases, *copied, *(("ic",) if device in "CL" else ()), *kind.data)
     for key, part in params.items():
         if key not in own and not (key == "lser" and isinstance(part, Number) and part.value == 0.0):
             shown = ", ".join(f"{k}=" for k in (*own, *kind.beside))
-            reason = ", there are no inductors here" if key == "lser" else ""
+            reason = "; an inductance in series is an L" if key == "lser" else ""
             raise InputError(f"{name} takes no parameter {key!r}{reason}; allowed: {shown}", part.key)
     given = [*statement.body, *(params[key] for key in kind.aliases if key in params)]
-    refuse(len(given) != 1, f"{name} needs one value in {spec.unit}, {len(given)} are given", statement)
-    value = _value(name, spec, number(given[0], f"{name} value", f"a number {spec.unit}"), notes)
+    unit = f" in {spec.unit}" if spec.unit else ""
+    refuse(len(given) != 1, f"{name} needs one value{unit}, {len(given)} are given", statement)
+    value = _value(name, spec, number(given[0], f"{name} {spec.name}", f"a number {spec.unit}".rstrip()), notes)
     copies = params.get(_COPIES)
     if copies is not None:
         if not isinstance(copies, Number) or not 1e-6 <= copies.value <= 1e6:
             raise InputError(f"{name} m is {copies.text!r}; allowed: a number of parts side by side", copies.where)
-        value = value / copies.value if device == "R" else value * copies.value
-    return {"value": value}, start_volts(f"{name} IC", params["ic"]) if "ic" in params else None
+        value = value * copies.value if device == "C" else value / copies.value
+    return {spec.name: value}, start_volts(f"{name} IC", params["ic"]) if "ic" in params else None
 
 
 def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> float:

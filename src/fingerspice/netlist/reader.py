@@ -95,6 +95,7 @@ class Context:
     tran: Tran | None  # On whose times SPICE's defaults depend
     folder: Path | None = None  # Folder of the deck; None for a deck given as text
     in_deck: bool = True  # Whether the source stands in a deck, which a SPICE may read, too
+    models: Mapping[str, Call] = field(default_factory=dict)  # By name in lower case
     anywhere: bool = False  # Whether any file may be read, relative to the working directory: for a user's own sources
     size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
 
@@ -189,8 +190,8 @@ MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
 _USED = (
-    ".tran", ".ac", ".op", ".dc", ".step", ".meas", ".measure", ".four", ".save", ".probe", ".print", ".options",
-    ".ic", ".param", ".func", ".global", ".subckt", ".ends", ".include", ".inc", ".lib", ".endl", ".control", ".end",
+    ".tran", ".ac", ".op", ".dc", ".step", ".meas", ".measure", ".four", ".save", ".probe", ".print", ".options", ".ic",
+    ".param", ".func", ".global", ".subckt", ".ends", ".include", ".inc", ".lib", ".endl", ".model", ".control", ".end",
 )  # fmt: skip
 _UNUSED = (".plot", ".title")
 #: Every directive that may stand in a deck; `Deck._direct` says what is done with it.
@@ -207,6 +208,7 @@ class Statement(NamedTuple):
     body: tuple[Word, ...]  # The words after the nodes; empty for an X
     params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
     where: Where  # Place of the name
+    control: tuple[str, ...] = ()  # Nodes or elements that control it, in lower case
 
 
 @dataclass(slots=True)
@@ -316,7 +318,7 @@ class Deck:
         """Do what a directive asks for, whose arguments begin at a position of its line."""
         here, place, text = self._open[-1], line.where(), line.text[rest:]
         match name:
-            case ".tran" | ".ac" | ".option" | ".options" | ".ic":
+            case ".tran" | ".ac" | ".option" | ".options" | ".ic" | ".model":
                 opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
                 refuse(here is not self.root and name != ".ic", f"{name} does not belong inside {opened}?", place)
                 if name in (".tran", ".ac"):

@@ -213,7 +213,8 @@ def vocabulary() -> dict[str, list[str]]:
         pairs = [p.name if p.default is None else f"{p.name}={p.default:g}" for p in one.parameters]
         given = " ".join(x if one.cells else "value" for x in pairs) if pairs else "[DC] value, AC ..., or a source"
         letter = "X..." if one.cells else f"{one.name}..."
-        devices.append(f"{letter} {' '.join((*one.nodes, *([one.name] if one.cells else [])))} {given}  ({one.what})")
+        heads = " ".join((*one.nodes, *one.control, *([one.name] if one.cells else [])))
+        devices.append(f"{letter} {heads} {given}  ({one.what})")
     sources = {name: one for name, one in SOURCES.items() if not one.refused}
     return {
         "elements and devices": [*devices, "X... node ... NAME key=value ...  (a .subckt)"],

@@ -12,6 +12,7 @@ import math
 import operator
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -143,15 +144,27 @@ _CIRCLE: list[Stroke] = [
     [(float(_RADIUS * np.cos(a)), float(_RADIUS * np.sin(a))) for a in np.linspace(0.0, 2.0 * np.pi, 61)],
     *([(0.0, s * _RADIUS), (0.0, s * _HALF)] for s in (1.0, -1.0)),
 ]
+_HALF_TURN = np.linspace(0.0, np.pi, 16)
 _PLUS_MINUS: list[Stroke] = [
     [(-0.045, 0.085), (0.045, 0.085)], [(0.0, 0.04), (0.0, 0.13)], [(-0.045, -0.085), (0.045, -0.085)]
 ]  # fmt: skip
 _ARROW: list[Stroke] = [[(0.0, 0.11), (0.0, -0.11)], [(-0.045, -0.05), (0.0, -0.11), (0.045, -0.05)]]
+_COIL: list[Stroke] = [
+    [(float(0.06 * np.sin(a)), float(0.15 - 0.1 * k - 0.05 * (1.0 - np.cos(a)))) for k in range(3) for a in _HALF_TURN],
+    *([(0.0, s * 0.15), (0.0, s * _HALF)] for s in (1.0, -1.0)),
+]
+_SWITCH: list[Stroke] = [[(0.0, _HALF), (0.0, 0.1)], [(0.0, -_HALF), (0.0, -0.1), (0.1, 0.08)]]
+_DIAMOND: list[Stroke] = [
+    [(0.0, _RADIUS), (_RADIUS, 0.0), (0.0, -_RADIUS), (-_RADIUS, 0.0), (0.0, _RADIUS)], *_CIRCLE[1:]
+]  # fmt: skip
 Symbol = tuple[list[Stroke], float, float]  # Strokes of a symbol, half its height, and half its width
 #: Symbols of the parts. The arrow of a current points from the first node to the second.
 _PARTS: dict[str, Symbol] = {
     "R": (_RESISTOR, _HALF, 0.08), "C": (_CAPACITOR, _HALF, 0.12),
     "V": (_CIRCLE + _PLUS_MINUS, _HALF, _RADIUS), "I": (_CIRCLE + _ARROW, _HALF, _RADIUS),
+    "L": (_COIL, _HALF, 0.08), "S": (_SWITCH, _HALF, 0.1),
+    **dict.fromkeys("EH", (_DIAMOND + _PLUS_MINUS, _HALF, _RADIUS)),
+    **dict.fromkeys("GF", (_DIAMOND + _ARROW, _HALF, _RADIUS)),
 }  # fmt: skip
 
 
@@ -246,6 +259,7 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     """The schematic of a circuit; arguments as in `Circuit.draw`."""
     count, allowed = len(circuit.elements), f"at most {MOST_ELEMENTS} in a picture"
     refuse(count > MOST_ELEMENTS, f"the circuit has {count:,} elements; allowed: {allowed}")
+    circuit = replace(circuit, elements=tuple(e for e in circuit.elements if e.nodes))  # A coupling has none.
     figure, placed = Schematic(facecolor="white"), place(circuit)
     pairs = [pair for e in circuit.elements for pair in zip(e.nodes[:2], e.node_names[:2], strict=True)]
     names = {node: drawing.drawable(name, _LONGEST) for node, name in reversed(pairs) if node != _GROUND}
@@ -332,7 +346,7 @@ def _label(element: Element, areas: Set[str]) -> tuple[str, ...]:
     if element.ac is not None:
         said.append(f"AC = {_quantity(element.ac.magnitude, unit)}")
     if element.initial is not None:
-        said.append(f"IC = {_quantity(element.initial, 'V')}")
+        said.append(f"IC = {_quantity(element.initial, 'A' if element.device == 'L' else 'V')}")
     if areas & set(element.nodes[2:]):
         said.append(f"area = {element.node_names[2]}")
     pieces = [piece for text in said for piece in drawing.drawable(text).split(", ")]

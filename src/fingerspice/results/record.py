@@ -317,7 +317,9 @@ class Record(Signals):
     def _s(self) -> FloatArray:
         """Values of the sources, and of those within a loop, V or A, shape (n_t, n_s + n_inner)."""
         waveforms = (e.waveform for e in (*self.network.sources, *self.network.inner))
-        return np.column_stack([sided(w, self.t, self.left) for w in waveforms if w is not None])
+        columns = [sided(w, self.t, self.left) for w in waveforms if w is not None]
+        # Currents that nodes' voltages follow stand beside the sources.
+        return np.column_stack([*columns, *(self.rows[:, -len(columns) :].T if self.network.senses else ())])
 
     def _voltage(self, by_x: FloatArray, by_s: FloatArray) -> FloatArray:
         """A voltage (V), shape (n_t,), as a weighted sum of the live voltages and the sources."""
@@ -404,18 +406,30 @@ class Record(Signals):
         area = np.column_stack([self._area_of(i) for i in range(net.gap.size)])
         held, met = np.zeros((2, self.t.size, n, n))
         for cell in range(net.c.size):
-            i, row = int(net.place[cell]), net.p[cell]
+            i, row, cut = int(net.place[cell]), net.p[cell], net.cut[cell]
             own = net.c[cell] * (np.ones(self.t.size) if i < 0 else area[:, i])
-            held += own[:, None, None] * np.outer(row, row)
+            held += own[:, None, None] * np.outer(cut, row)
             if i >= 0 and net.gap[i] >= 0 and net.slow[i] < 0:
                 u = self.cell_voltage(int(net.gap[i]))
                 inverse, slope = inverse_area_array(np.abs(u), net.curves[i])
                 cross = net.c[cell] * self.cell_voltage(cell) * -np.sign(u) * slope / inverse**2
-                met += cross[:, None, None] * np.outer(row, net.p[net.gap[i]])
+                met += cross[:, None, None] * np.outer(cut, net.p[net.gap[i]])
         return read_only(np.linalg.det(held + met) / np.linalg.det(held))
 
     @cached_property
     def node_voltages(self) -> dict[str, FloatArray]:  # type: ignore[override]
-        n = self._x.shape[1]
-        rows = zip(self.network.node_names, self.network.nodes, strict=True)
-        return {name: read_only(self._voltage(row[:n], row[n:])) for name, row in rows}
+        n, course, out = self._x.shape[1], self.network.course, dict[str, FloatArray]()
+        for name, row in zip(self.network.node_names, self.network.nodes, strict=True):
+            out[name] = read_only(self._voltage(row[:n], row[n:]))
+        if course is None or not self.t.size:
+            return out
+        times, on = course.changes(float(self.t.max()))
+        state = np.where(self.left, times.searchsorted(self.t), times.searchsorted(self.t, "right"))
+        kinds, which = np.unique(on, axis=0, return_inverse=True)
+        every = np.hstack([self._x, self._s])
+        networks = [self.network.switched(tuple(kind.tolist())) for kind in kinds]
+        values = np.zeros((self.t.size, len(out)))
+        for kind, network in enumerate(networks):
+            here = which.ravel()[state] == kind
+            values[here] = np.einsum("tc,nc->tn", every[here], network.nodes)
+        return {name: read_only(column) for name, column in zip(out, values.T.copy(), strict=True)}

@@ -106,6 +106,20 @@ class Collocation(Integration):
         )  # fmt: skip
 
     def through(self, sources: Sources, t_end: float) -> Status:
+        if (course := self.problem.network.course) is None:
+            return self.between(sources, t_end)
+        times, on = course.changes(self.problem.t_stop)
+        status, k = Status.SUCCESS, int(times.searchsorted(self.t, "right"))
+        while status is Status.SUCCESS and self.t < t_end:
+            self.net = self.problem.scene.switched(tuple(on[k].tolist()))
+            status = self.between(sources, min(t_end, float(times[k])) if k < times.size else t_end)
+            # The first step after a change is as long as that after the last one.
+            self.control[[implicit.H, implicit.JUMPED]] = self.control[implicit.H_AFTER_JUMP], 1.0
+            k += 1
+        return status
+
+    def between(self, sources: Sources, t_end: float) -> Status:
+        """As `through`, while no switch changes."""
         run = self.nodal(sources)
         while True:
             code = advance(run, t_end)
@@ -171,7 +185,7 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
     probing, probed = _with_probes(problem)
     compared = probing.at(probing.t_out[probed], probing.left[probed])
     u_scale = problem.largest
-    if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
+    if problem.network.active or problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
     finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
     tol, nfev, folded = max(LOCAL_SHARE * rtol, finest), 0, math.inf
@@ -239,7 +253,7 @@ def _announced(progress: Progress | None, reason: str) -> Progress:
 
 
 def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:
-    """Largest live voltage, V, from coarse runs: under a current drive it is not known beforehand.
+    """Largest live voltage, V, from coarse runs: under a current drive, or an amplifier, it is not known beforehand.
 
     A high guess is better than a low one: a coarse run whose voltages are much smaller than the guess is cheap, whereas
     much larger voltages would be integrated far too accurately.
@@ -363,7 +377,7 @@ class Foreign(Collocation):
             raise _FailedError("torchdiffeq returned NaN")
         return states, count
 
-    def through(self, sources: Sources, t_end: float) -> Status:
+    def between(self, sources: Sources, t_end: float) -> Status:
         edges = np.unique(sources.edges)
         for stop in np.append(edges[(edges > self.t) & (edges < t_end)], t_end).tolist():
             after, _ = values_at(sources, self.t)

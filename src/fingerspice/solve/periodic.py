@@ -28,7 +28,7 @@ from fingerspice.solve.problem import Problem, joined, prepare, to_ends
 from fingerspice.solve.runs import no_period
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
 from fingerspice.waveforms.sampling import source_table
-from fingerspice.waveforms.waveform import OFF, Waveform, require
+from fingerspice.waveforms.waveform import OFF, Waveform, refuse, require
 
 # Number of equidistant times of a period from which the mean of an area with a time constant is computed.
 SAMPLES = 64
@@ -440,6 +440,8 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Period]:
     """
     if problem.network.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
+    needed = "a periodic state is found by modes that decay without oscillation, and this circuit has inductors or"
+    refuse(problem.network.active, f"{needed} amplifiers; allowed: a run of more periods, and phasor")
     period = Search(problem, rtol) if problem.scene.coupled else Period(problem)
     period.close()
     y, moved = np.append(period.start, np.zeros(period.before.size)), period.begin - problem.t_start

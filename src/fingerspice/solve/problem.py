@@ -107,7 +107,8 @@ class Problem:
     def longest_step(self, share: float, start: float, stop: float) -> float:
         """Longest step (s) between two times (s): a share of the shortest time there, and what the deck allows."""
         tran, shortest = self.circuit.tran, self.network.waveform.shortest_time(start, stop)
-        most = math.inf if tran is None or tran.max_step is None else tran.max_step
+        # Of a network with inductors or amplifiers no step needs a bound: all of them are tested by their error.
+        most = math.inf if tran is None or tran.max_step is None or self.network.active else tran.max_step
         return min(share * shortest, self.t_stop - self.t_start, most)
 
 
@@ -148,7 +149,7 @@ def prepare(
     return Problem(
         circuit, scene, t_start, end, t_start + (tran.start if tran else 0.0),
         tran.step if tran else (stop - t_start) / 1000.0,
-        initial_state(circuit, scene, "uncharged" if start == "periodic" else start), charge,
+        initial_state(circuit, scene, "uncharged" if start == "periodic" else start), charge or scene.network.senses,
         start if isinstance(start, str) else "given", t_stop is None and tran is not None,
     )  # fmt: skip
 

@@ -24,8 +24,9 @@ from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, Stat
 from fingerspice.results.record import Record
 from fingerspice.results.steps import ClosedForm, Recorded
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, shortest_event, values_at
+from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.sampling import Function, breakpoints_at
-from fingerspice.waveforms.waveform import DOUBLE
+from fingerspice.waveforms.waveform import DOUBLE, Sum
 
 Progress = Callable[[float], None]
 
@@ -123,7 +124,10 @@ def excess_of(gaps: FloatArray, rounding: float) -> float:
 
 def closed_form(problem: Problem, again: Callable[[Problem], Run], error: float = 0.0) -> ClosedForm:
     """The run between its outputs, by a method that computes it `again` with any outputs; see `ClosedForm`."""
-    look, wave = partial(_look, problem, again), problem.network.waveform
+    look, wave, course = partial(_look, problem, again), problem.network.waveform, problem.network.course
+    if course is not None and (times := course.changes(problem.t_stop)[0]).size:
+        # A source of 0 V has breakpoints where switches change.
+        wave = Sum((wave, PWL(tuple(times.tolist()), (0.0,) * times.size)))
     return ClosedForm(look, wave, problem.t_start, error, problem.rounding)
 
 

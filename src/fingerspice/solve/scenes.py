@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -68,6 +69,11 @@ class Scene(Remembering):
         slow = np.where(tau > 0.0, np.cumsum(tau > 0.0) - 1, -1)
         return Net._make((self.charge_law == "mobile", *network.arrays, gap, area0, tau, slow, padded))
 
+    def switched(self, on: tuple[bool, ...]) -> Net:
+        """The equations with these switches on."""
+        k, b, through, delivered, _ = self.network.switched(on).arrays[6:]
+        return self.net._replace(k=k, b=b, through=through, delivered=delivered)
+
     @property
     def shown(self) -> Scene:
         """The scene in whose form exponential steps record a stack: a voltage for each layer, not for each cell."""
@@ -84,7 +90,9 @@ class Scene(Remembering):
 
     @cached_property
     def rates(self) -> FloatArray:
-        """Decay rates of these modes, 1/s."""
+        """Decay rates of these modes, 1/s; of modes that may oscillate, the real parts."""
+        if self.network.active:
+            return self.network.decay(self.net.area0)
         if self.model is None:
             return self.modes.rates
         rates, _, _, _ = modes(self.model.rate + self.model.rate0 / self.model.area0, self.model.k)
@@ -136,10 +144,10 @@ def scene_of(
             mode = f"{fixed[0]:g} m^2 (from the deck)" if len(fixed) == 1 else "given by the deck" if fixed else "none"
         elif area != "coupled":
             fixed = tuple(map(float, mean_areas(network) if area == "mean" else network.areas_at_rest))
-        waves = network.waveforms[: network.n_voltage]
-        u_peak = sum(_largest_voltage(wave, stop, network.stack is not None) for wave in waves)
-        u_size = max(u_peak, sum(wave.cancelling(0.0, stop) for wave in waves))
-        by_current = DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0
+        waves = [*zip(network.waveforms[: network.n_voltage], network.lift or itertools.repeat(1.0), strict=False)]
+        u_peak = sum(lift * _largest_voltage(wave, stop, network.stack is not None) for wave, lift in waves)
+        u_size = max(u_peak, sum(lift * wave.cancelling(0.0, stop) for wave, lift in waves))
+        by_current = DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage or network.active else 0.0
         top = BEYOND_PEAK * u_peak + by_current or PEAK_UNKNOWN
         model = None if network.stack is None else _model(network.stack, law, fixed[0], top)
         return Scene(network, law, mode, fixed, u_peak, u_size, top, model, skin)

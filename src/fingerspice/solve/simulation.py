@@ -17,6 +17,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import Parameters, Sources, circuit_warnings, overridden
+from fingerspice.circuit.network import Network
 from fingerspice.physics.contact import inverse_area_range
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
@@ -206,7 +207,7 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     area, changed = float(scene.net.area0[0]) if scene.fixed else math.nan, math.nan if scene.coupled else 0.0
     if model is not None and model.coupled:
         changed, area = _change(model.curve, scene.u_peak)
-    elif scene.coupled and len(problem.network.sources) == problem.network.n_voltage:
+    elif scene.coupled and not unbounded(problem.network):
         changed = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
     best, reason = _best(problem, rtol, changed)
     chosen = best if tier == "auto" else tier
@@ -222,6 +223,8 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
         reasons += [REPEATS] if span / problem.network.waveform.period >= FEWEST_PERIODS else []
     if chosen == "linear" and model is not None and scene.coupled and np.any(model.rate0 > 0.0):
         needed = changed
+    if problem.network.active:
+        reasons.append("inductors, amplifiers or switches: voltages may oscillate or grow, which implicit steps take")
     if chosen == "coupled" and problem.network.owned:
         reasons.append("the gap's height, or its leak, follows its voltage, which implicit steps take")
     if scene.skin is not None:
@@ -262,22 +265,30 @@ def _best(problem: Problem, rtol: float, changed: float) -> tuple[str, str]:
     stores = scene.coupled and model is not None and model.mobile and problem.stored > 0.0
     if model is not None and not (model.rate.any() or model.rate0.any() or stores):
         return "algebraic", "no layer leaks, so the voltages follow the source at once"
+    if not scene.coupled and problem.network.active:
+        return "coupled", "a network with inductors, amplifiers or switches, whatever its areas"
     if not scene.coupled:
         which = f"the area{' is' if model is not None else 's are'} {scene.area_mode}"
         return "linear", f"{which if scene.fixed else 'no element has an area'}, so the circuit is linear"
     if model is None:
         follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
-        if math.isnan(changed):
-            return "coupled", f"{follows}; by how much is not known beforehand: a current source sets no bound"
+        if (free := unbounded(problem.network)) and math.isnan(changed):
+            return "coupled", f"{follows}; by how much is not known beforehand: {free} sets no bound"
         return "coupled", f"{follows}, {'each ' if several else ''}by up to {_percent(changed)} of its middle"
-    free = not model.rate0.any()
-    if model.mobile or not (free or changed <= 0.2 * rtol):
+    insulating = not model.rate0.any()
+    if model.mobile or not (insulating or changed <= 0.2 * rtol):
         return "coupled", f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
     if problem.charge:
         return "coupled", "only the charge needs the area at every instant; charge=False leaves it out"
-    if free:
+    if insulating:
         return "linear", "every leak scales with the area, so under the local law no voltage feels it"
     return "linear", f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
+
+
+def unbounded(network: Network) -> str:
+    """What keeps the sources' voltages from bounding those of a network; empty if nothing does."""
+    amplified = "an inductor, an amplifier or a switch" if network.active else ""
+    return amplified or ("a current source" if len(network.sources) > network.n_voltage else "")
 
 
 def _percent(share: float) -> str:
@@ -359,7 +370,7 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
     if method == "auto" and (recorded := solve_recording(problem, rtol, progress)) is not None:
         return recorded, "relaxation"
     is_stack, reason = problem.network.stack is not None, ""
-    if problem.network.owned and problem.scene.coupled:
+    if problem.network.active or (problem.network.owned and problem.scene.coupled):
         method = "radau"
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, progress, repeat=method == "auto")

@@ -107,11 +107,14 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
             return _state(scene, *_at_rest(circuit, scene, circuit.initial if asked else {}))
         # An area is NaN if it follows its voltage without delay, or if it starts in equilibrium with it.
         u, area = np.zeros(len(network.cells)), np.full(len(network.areas), np.nan)
-        if asked and (circuit.initial or any(cell.element.initial is not None for cell in network.cells)):
+        if asked and (circuit.initial or any(e.initial is not None for e in circuit.elements)):
             # The slabs of a dispersive layer share its voltage in proportion to their elastances, as in a jump.
             _, layer = np.unique([cell.element.name for cell in network.cells], return_inverse=True)
             share = (1.0 / scene.net.c) / np.bincount(layer, 1.0 / scene.net.c)[layer]
             u = share * [start_voltage(cell.element, circuit.initial) for cell in network.cells]
+            if network.coils.size:
+                currents = [e.initial or 0.0 for e in circuit.by_device("L")]
+                u[-len(network.coils) :] = network.coils @ currents
             for i, one in enumerate(network.areas):
                 if scene.net.slow[i] >= 0:
                     area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
@@ -265,6 +268,9 @@ def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Elemen
 def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
     """Refuse a network in which some voltage is determined by capacitors only, so that it has no DC value."""
     leak = network.leak(area)
+    if network.active:
+        _refuse_undetermined_at_dc(network, leak)
+        return
     if np.all(leak > 0.0) or not network.live:
         return
     factor = np.vstack([network.resistor_factor, np.sqrt(leak)[:, None] * network.p])
@@ -278,6 +284,22 @@ def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
         raise InputError(
             f"no DC operating point: {' and '.join(names)} leave nodes that are reached by capacitors only; allowed: a "
             "leakage (r=...) or an R, or uic in .tran to start uncharged"
+        )
+
+
+def _refuse_undetermined_at_dc(network: Network, leak: FloatArray) -> None:
+    """The same of a network with inductors or amplifiers, whose equations may have no or many solutions."""
+    matrix, _ = network.stiffness(leak)
+    matrix = matrix / np.maximum(np.abs(matrix).max(axis=1, initial=0.0), 1e-300)[:, None]
+    matrix = matrix / (size := np.maximum(np.abs(matrix).max(axis=0, initial=0.0), 1e-300))
+    _, sigma, turned = np.linalg.svd(matrix)
+    if sigma.size and sigma[-1] <= 1e-13 * sigma[0]:
+        free = turned[-1] / size
+        live = [network.cells[i].element.name for i in network.live]
+        names = ", ".join(dict.fromkeys(np.array(live)[np.abs(free) > 1e-6 * np.abs(free).max()].tolist()))
+        raise InputError(
+            f"no DC operating point: nothing determines {names}, in a loop of inductors and sources, or at nodes that "
+            "are reached by capacitors only; allowed: an R in the loop or beside them, or uic in .tran"
         )
 
 

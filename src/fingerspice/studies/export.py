@@ -101,6 +101,9 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
         for one in filter(None, (element, beside_gap(element))):
             text = _element_line(one, circuit, ratio, areas)
             lines += textwrap.wrap(text, 100, subsequent_indent="+ ", break_long_words=False, break_on_hyphens=False)
+    for e in circuit.by_device("S"):
+        values = " ".join(f"{key}={value!r}" for key, value in e.values.items())
+        lines.append(f".model model_{_element_name(e)} SW({values})")
     if (tran := circuit.tran) is not None:
         more = (tran.start, tran.max_step) if tran.max_step else (tran.start,) if tran.start else ()
         lines.append(f".tran {' '.join(map(repr, (tran.step, tran.stop, *more)))}{' uic' if tran.uic else ''}")
@@ -218,7 +221,10 @@ def _element_line(element: Element, circuit: Circuit, work_ratio: float, start_a
         return f"{head} {_source_text(element.waveform, element.name, circuit)}{ac}"
     if element.spec.cells is None:
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
-        return f"{head} {element.values['value']!r}{initial}"
+        if element.device == "S":
+            return f"{head} {' '.join(_controls(element, circuit))} model_{_element_name(element)}"
+        (value,) = element.values.values()
+        return f"{head} {' '.join([*_controls(element, circuit), repr(value)])}{initial}"
     # Left out are what only a warning or the friction needs, and a CPE beside a gap, which is written for itself.
     left_out = ("p_sat", "slip", "v", "q", "n_cpe") if element.device == "GAP" else ("e_max",)
     tabled = element.device == "GAP" and acting_law(element) is not None
@@ -231,6 +237,14 @@ def _element_line(element: Element, circuit: Circuit, work_ratio: float, start_a
     extra += f" a_ic={start_areas[element.nodes[2]]!r}" if held and element.spec.is_layer else ""
     device = f"GAP_{_element_name(element)}" if tabled else element.device
     return f"{head} {device} {values}{extra}"
+
+
+def _controls(element: Element, circuit: Circuit) -> list[str]:
+    """Names of the nodes or elements that control an element."""
+    if "node" not in element.spec.control:
+        return [_element_name(circuit[name]) for name in element.control]
+    written = {node: name for e in circuit.elements for node, name in zip(e.nodes, e.node_names, strict=True)}
+    return [_name(written.get(node, node)) for node in element.control]
 
 
 def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:

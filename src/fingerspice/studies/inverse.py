@@ -69,6 +69,8 @@ class Finger:
         said = f"{self.gap.name} has p_sat={p_sat:g} Pa, slip={slip:g} m"
         refuse(p_sat < math.inf or slip > 0.0, f"{said}: friction is not mu times its load; allowed here: inf and 0")
         scene = linear_scene(circuit)
+        amplified = "an inverse drive needs modes that decay without oscillation, and this circuit has inductors"
+        refuse(scene.network.active, f"{amplified} or amplifiers; allowed: the drive behind them, by a V element")
         follows = f"{self.gap.name} has a height, or a leak, that follows its voltage"
         refuse(scene.network.owned, f"{follows}; allowed here: another contact law, and r_exp=0")
         self.network, self.contact, stack = scene.network, scene.contact, scene.network.stack

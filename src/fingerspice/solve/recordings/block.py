@@ -347,6 +347,8 @@ def ready(problem: Problem, rtol: float) -> LaneForm | None:
     if scene.network.stack is not None:
         key = *key, scene.charge_law, rounded_peak(scene.u_peak)
         return scene.network.stack.remember(key, lambda: stack(problem, decade), MOST_FORMS)
+    if scene.network.active:
+        return None
     source, wave = driving(problem)
     assert isinstance(wave, Samples)
     return scene.remember(key, partial(finger, problem, decade, source, wave), MOST_FORMS)

@@ -1,0 +1,280 @@
+"""Controlled sources, inductors and switches: closed forms, ngspice under both charge laws, stated errors, refusals."""
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+
+import fingerspice as fs
+from ngspice_tools import run_ngspice, with_charge_law
+from scenes import every_law
+
+FINGER = """\
+Xcoat  top a    area LAYER d=1u eps_r=3.9 r=0.2meg
+Xgap   a   skin area GAP   d=3.5u eps_r=1 r=1meg
+Xskin  skin 0   area SKIN  d=350u f=1k
+.nodeset v(area)=34.97
+"""
+#: Decks with a finger behind what is tested, each with the nodes that are compared and ngspice's largest step, s.
+DECKS = {
+    "op-amp": ("Vin in 0 SIN(0 2 1k)\nR1 in m 10k\nR2 m out 1meg\nC2 m out 10p\nE1 out 0 0 m 1e5\nRout out top 10k\n"
+               ".tran 1u 3m uic\n", ["out", "m"], 2e-7),
+    "op-amp with a pole": ("Vin in 0 SIN(0 2 1k)\nR1 in m 10k\nR2 m out 1meg\nG1 0 x 0 m 1m\nRx x 0 100meg\n"
+                           "Cx x 0 160p\nE1 out 0 x 0 1\nRout out top 10k\n.tran 1u 3m uic\n", ["out", "x"], 2e-7),
+    "transformer": ("Vin in 0 SIN(0 10 1k)\nR1 in p 1\nL1 p 0 10m\nL2 s 0 4\nK1 L1 L2 0.999\nR2 s top 1k\n"
+                    ".tran 1u 2m uic\n", ["p", "s"], 3e-8),
+    "currents": ("Vin in 0 SIN(0 200 1k)\nR0 in b 100k\nVs b c 0\nR5 c top 1\nRc c 0 200k\nF1 0 mon Vs 2\nR1 mon 0 10k\n"
+                 "C1 mon 0 1n\nH1 h 0 Vs 50k\nR3 h f 1k\nC3 f 0 10n\n.tran 1u 3m uic\n", ["mon", "f"], 1e-7),
+    "boost": ("Vdc in 0 5\nVc c 0 PULSE(0 5 1u 0.2n 0.2n 7u 10u)\nL1 in y 100u\nR0 y x 0.5\nS1 x 0 c 0 low\n"
+              "S2 x o 0 c high\nC1 o 0 1u\nR1 o 0 1k\nR2 o top 10k\n.model low SW(Ron=0.2 Roff=1meg Vt=2.5 Vh=0)\n"
+              ".model high SW(Ron=0.2 Roff=1meg Vt=-2.5)\n.tran 1u 0.2m uic\n", ["o", "x"], 5e-9),
+    "H-bridge": ("Vdc p 0 100\nVa a 0 PULSE(0 5 0 0.2n 0.2n 100u 200u)\nS1 p x a 0 on\nS2 x 0 a 0 off\n"
+                 "S3 p y a 0 off\nS4 y 0 a 0 on\nR1 x m 20k\nL1 m top 10m\nR9 y q 100\nC9 q 0 1n\n"
+                 ".model on SW(Ron=10 Roff=100meg Vt=2.5 Vh=0.5)\n.model off SW Ron=100meg Roff=10 Vt=2.5 Vh=0.5\n"
+                 ".tran 1u 0.5m uic\n", ["x", "top"], 5e-9),
+}  # fmt: skip
+
+
+def deck(name: str) -> str:
+    return f"t\n.include fingerspice.lib\n{DECKS[name][0]}{FINGER}.end\n"
+
+
+def parse(lines: str) -> fs.Circuit:
+    return fs.parse_netlist(f"t\n{lines}\n.end\n")
+
+
+def apart(one: np.ndarray, other: np.ndarray) -> float:
+    """Largest difference over the peak."""
+    return float(np.abs(one - other).max() / np.abs(other).max())
+
+
+@every_law
+@pytest.mark.parametrize("name", DECKS)
+def test_drivers_of_a_finger_agree_with_ngspice(name: str, law: str) -> None:
+    text, (_, nodes, step) = with_charge_law(deck(name), law), DECKS[name]
+    # The exported deck as well, which has every element in its own words.
+    for one in (text, fs.export_netlist(fs.parse_netlist(text)) if name in ("currents", "H-bridge") else None):
+        if one is None:
+            continue
+        theirs = run_ngspice(one, ["v(a)-v(skin)", *(f"v({node})" for node in nodes)], max_step=step)
+        t, keep = np.unique(np.minimum(theirs["time"], fs.parse_netlist(text).tran.stop), return_index=True)
+        late = (t > 5e-6) & ~inside_edges(text, t)
+        ours = fs.simulate(fs.parse_netlist(text), t_eval=t[late])
+        assert ours.method == "radau"
+        assert apart(ours.u_gap, theirs["v(a)-v(skin)"][keep][late]) <= 1e-5
+        for node in nodes:
+            assert apart(ours.node_voltages[node], theirs[f"v({node})"][keep][late]) <= 1e-5
+
+
+def inside_edges(text: str, t: np.ndarray) -> np.ndarray:
+    """Times beside an edge of a pulse, in which switches change here and at ngspice's next step there."""
+    edges = [e.waveform.breakpoints(0.0, 1.0) for e in fs.parse_netlist(text).by_device("V") if "PULSE" in text]
+    near = np.unique(np.concatenate([*edges, [-1.0]]))
+    return np.abs(t - near[np.abs(t[:, None] - near).argmin(axis=1)]) < 1.1e-8
+
+
+@every_law
+@pytest.mark.parametrize("name", DECKS)
+def test_stated_errors_are_met(name: str, law: str) -> None:
+    circuit = fs.parse_netlist(with_charge_law(deck(name), law))
+    fine = fs.simulate(circuit, rtol=1e-12)
+    for rtol in (1e-4, 1e-8):
+        run = fs.simulate(circuit, rtol=rtol)
+        assert np.abs(run.u_gap - fine.u_gap).max() <= run.error.u_gap + fine.error.u_gap
+        assert run.error.u_gap <= rtol * np.abs(run.u_gap).max()
+        for node, v in run.node_voltages.items():
+            assert np.abs(v - fine.node_voltages[node]).max() <= run.error.v_nodes + fine.error.v_nodes
+
+
+def test_scipy_integrates_the_same_equations() -> None:
+    circuit = fs.parse_netlist(deck("op-amp with a pole"))
+    one, other = fs.simulate(circuit), fs.simulate(circuit, rtol=1e-6, method="scipy:Radau")
+    assert apart(other.u_gap, one.u_gap) <= 1e-6
+
+
+@pytest.mark.parametrize("resistance", [1.0, 10.0, 2.0 * math.sqrt(1e3), 500.0])
+def test_a_series_rlc_follows_its_closed_form(resistance: float) -> None:
+    run = fs.simulate(parse(f"V1 a 0 5\nR1 a b {resistance!r}\nL1 b c 1m\nC1 c 0 1u\n.tran 1u 1m uic"))
+    alpha, w0 = resistance / 2e-3, 1.0 / math.sqrt(1e-9)
+    w = np.sqrt(complex(w0**2 - alpha**2)) + 1e-9
+    v = 5.0 * (1.0 - np.exp(-alpha * run.t) * (np.cos(w * run.t) + alpha / w * np.sin(w * run.t))).real
+    assert np.abs(run.node_voltages["c"] - v).max() <= run.error.v_nodes + 1e-8
+    assert run.error.v_nodes <= 1e-7
+
+
+def test_an_lc_circuit_keeps_its_energy() -> None:
+    run = fs.simulate(parse("C1 a 0 1u IC=10\nL1 a b 1m IC=0.2\nVs b 0 0\n.tran 1u 10m uic"), rtol=1e-10)
+    u, i = run.node_voltages["a"], -run.i_source
+    energy = 0.5e-6 * u**2 + 0.5e-3 * i**2
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-10)
+    w, z = 1.0 / math.sqrt(1e-9), math.sqrt(1e3)
+    np.testing.assert_allclose(u, 10.0 * np.cos(w * run.t) - 0.2 * z * np.sin(w * run.t), rtol=0, atol=1e-9)
+
+
+def test_windings_with_a_coupling_of_1_are_a_transformer_with_its_magnetising_inductance() -> None:
+    source = "V1 a 0 SIN(0 5 1k)\nR1 a b 10\n"
+    two = fs.simulate(parse(f"{source}L1 b 0 10m\nL2 c 0 40m\nK1 L1 L2 1\nR2 c 0 100\n.tran 5u 3m uic"))
+    # The load counts with the square of the ratio of 2.
+    one = fs.simulate(parse(f"{source}L1 b 0 10m\nR2 b 0 25\n.tran 5u 3m uic"))
+    np.testing.assert_allclose(two.node_voltages["b"], one.node_voltages["b"], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(two.node_voltages["c"], 2.0 * one.node_voltages["b"], rtol=0, atol=1e-7)
+
+
+def test_three_windings_may_be_coupled_by_one_line() -> None:
+    head, tail = "V1 a 0 SIN(0 5 1k)\nR1 a b 10\nL1 b 0 1m\nL2 c 0 2m\nL3 d 0 3m\n", "R2 c 0 10\nR3 d 0 10\n.tran 5u 1m"
+    whole = fs.simulate(parse(f"{head}K1 L1 L2 L3 0.9\n{tail}"))
+    pairs = fs.simulate(parse(f"{head}K1 L1 L2 0.9\nK2 L2 L3 0.9\nK3 L1 L3 0.9\n{tail}"))
+    np.testing.assert_array_equal(whole.node_voltages["d"], pairs.node_voltages["d"])
+
+
+def test_a_switch_changes_where_its_control_passes_the_threshold() -> None:
+    run = fs.simulate(parse(
+        "V1 a 0 10\nVc c 0 SIN(0 1 1k)\nS1 a b c 0 sw\nC1 b 0 1u\nR1 b 0 1k\n"
+        ".model sw SW(Ron=100 Roff=1e9 Vt=0.5 Vh=0.2)\n.tran 5u 3m uic"), rtol=1e-10)  # fmt: skip
+    on, off = math.asin(0.7) / (2e3 * math.pi), (math.pi - math.asin(0.3)) / (2e3 * math.pi)
+    times = np.append(1e-3 * np.repeat([0.0, 1.0, 2.0], 2) + np.tile([on, off], 3), 1.0)
+    v, since, expected = 0.0, 0.0, np.zeros(run.t.size)
+    for k, until in enumerate(times.tolist()):
+        closed = 1e-2 if k % 2 else 1e-9
+        end, rate = 10.0 * closed / (closed + 1e-3), (closed + 1e-3) / 1e-6
+        now = (run.t >= since) & (run.t < until)
+        expected[now] = end + (v - end) * np.exp(-rate * (run.t[now] - since))
+        v, since = end + (v - end) * math.exp(-rate * (until - since)), until
+    np.testing.assert_allclose(run.node_voltages["b"], expected, rtol=0, atol=1e-9)
+
+
+def test_phasors_are_those_of_the_closed_forms() -> None:
+    f = np.geomspace(10.0, 1e6, 41)
+    s = 2j * np.pi * f
+    rlc = fs.phasor(parse("V1 a 0 AC 1\nR1 a b 10\nL1 b c 1m\nC1 c 0 1u"), f)
+    np.testing.assert_allclose(rlc.impedance, 10.0 + 1e-3 * s + 1e6 / s, rtol=1e-12)
+    amplifier = fs.phasor(parse("V1 in 0 AC 1\nR1 in m 10k\nR2 m out 1meg\nC2 m out 10p\nE1 out 0 0 m 1e5\nR3 out 0 1k"), f)
+    ratio = 1.0 / (1e-6 + 1e-11 * s) / 1e4
+    gain = amplifier.v_nodes[:, amplifier.nodes.index("out")]
+    np.testing.assert_allclose(gain, -ratio / (1.0 + (1.0 + ratio) / 1e5), rtol=1e-12)
+
+
+def test_the_operating_point_has_inductors_as_wires_and_amplifiers_with_their_gain() -> None:
+    lines = "V1 a 0 5\nR1 a b 10\nL1 b c 1m\nR2 c 0 40\nC1 c 0 1u\nG1 0 d c 0 1m\nR3 d 0 1k\nE1 e 0 d 0 3\nR4 e 0 1k"
+    run = fs.simulate(parse(f"{lines}\n.tran 1u 1m"))
+    for node, value in (("c", 4.0), ("d", 4.0), ("e", 12.0)):
+        np.testing.assert_allclose(run.node_voltages[node], value, rtol=1e-9)
+
+
+@every_law
+def test_a_source_that_follows_another_keeps_the_exponential_steps(law: str) -> None:
+    drive = "Vin in 0 SIN(0 {} 1k)\n{}Rout {} top 10k\n.tran 2u 3m uic\n"
+    text = f"t\n.include fingerspice.lib\n{drive}{FINGER}.end\n"
+    followed = fs.parse_netlist(text.format(2, "E1 out 0 in 0 100\n", "out"))
+    own = fs.simulate(fs.parse_netlist(text.format(200, "", "in")), charge_law=law)
+    run, other = fs.simulate(followed, charge_law=law), fs.simulate(followed, charge_law=law, method="radau")
+    assert (run.method, other.method) == ("exponential", "radau")
+    assert apart(run.u_gap, own.u_gap) <= 1e-8
+    assert apart(other.u_gap, own.u_gap) <= 1e-8
+    assert fs.steady_state(followed, charge_law=law).error.u_gap <= 1e-5
+
+
+def test_elements_of_subcircuits_control_those_beside_them() -> None:
+    body = "Vs p q 0\nF1 0 out Vs {gain}\nRs q 0 1k\nL1 q x 1m\nL2 out y 1m\nK1 L1 L2 0.5\nRx x 0 50\nRy y 0 50\nRo out 0 1k"
+    circuit = parse(f"V1 in 0 SIN(0 1 1k)\n.subckt mirror p out gain=1\n{body}\n.ends\nX1 in a mirror gain=2\nX2 in b mirror\n"
+                    ".tran 5u 1m uic")  # fmt: skip
+    assert circuit["X1.F1"].control == ("x1.vs",)
+    assert circuit["X2.K1"].control == ("x2.l1", "x2.l2")
+    run = fs.simulate(circuit)
+    assert np.abs(run.node_voltages["a"]).max() > np.abs(run.node_voltages["b"]).max() > 0.0
+    changed = circuit.replace({"X1.F1.gain": 1.0, "X1.K1.k": 0.5})
+    run = fs.simulate(changed)
+    np.testing.assert_allclose(run.node_voltages["a"], run.node_voltages["b"], rtol=0, atol=1e-12)
+
+
+def test_runs_of_such_circuits_go_on_are_kept_and_are_batched() -> None:
+    circuit = fs.parse_netlist(deck("H-bridge"))
+    whole, half = fs.simulate(circuit), fs.simulate(circuit, t_stop=0.25e-3)
+    rest = fs.simulate(circuit, start=half, t_stop=0.5e-3, t_eval=whole.t[whole.t > 0.3e-3])
+    assert apart(rest.u_gap, whole.u_gap[whole.t > 0.3e-3]) <= 1e-7
+    for kept in (pickle.loads(pickle.dumps(whole)), copy.deepcopy(whole)):
+        np.testing.assert_array_equal(kept.node_voltages["x"], whole.node_voltages["x"])
+    found = fs.batch(circuit, {"Xgap.d": [3e-6, 3.5e-6]}, rtol=1e-6)
+    assert float(found.f_el_mean[1]) == pytest.approx(whole.f_el_mean, rel=1e-5)
+    circuit.draw()
+    assert "S1" in str(circuit)
+
+
+def test_recordings_drive_amplifiers_by_implicit_steps() -> None:
+    rate = 20e3
+    samples = fs.Samples(np.sin(2.0 * np.pi * 100.0 * np.arange(200) / rate), rate)
+    circuit = fs.parse_netlist(deck("op-amp"))
+    run = fs.simulate(circuit, sources={"Vin": samples}, t_stop=9e-3)
+    assert run.method == "radau"
+    assert fs.simulate(circuit, sources={"Vin": samples}, t_stop=9e-3, rtol=1e-10).u_gap == pytest.approx(run.u_gap, abs=1e-5)
+
+
+def test_plans_say_that_steps_are_implicit() -> None:
+    told = fs.plan(fs.parse_netlist(deck("transformer")))
+    assert told.tier == "coupled"
+    assert any("implicit steps" in reason for reason in told.reasons)
+    assert "an inductor, an amplifier or a switch sets no bound" in told.reasons[0]
+
+
+def test_what_needs_decaying_modes_refuses() -> None:
+    circuit = fs.parse_netlist(deck("op-amp"))
+    with pytest.raises(fs.InputError, match="the linear tier is not for this network; allowed: auto or coupled"):
+        fs.simulate(parse("V1 a 0 5\nR1 a b 10\nL1 b 0 1m\n.tran 1u 1m uic"), tier="linear")
+    with pytest.raises(fs.InputError, match="an inverse drive needs modes that decay without oscillation"):
+        fs.inverse_drive(circuit, force=np.full(100, 0.1), rate=1e4)
+
+
+HEAD = "V1 a 0 1\nR1 a 0 1k\n"
+BAD = [
+    ("E1 c 0 c 0 1\nR2 c 0 1k", 4, "the equations of E1 have no solution: a loop gain is 1"),
+    ("E1 b 0 c 0 2\nR2 b 0 1k\nE2 c 0 b 0 0.5\nR3 c 0 1k", 4, "the equations of E1, E2 have no solution"),
+    ("E1 a 0 a 0 2", 4, "V1 and E1 are voltage sources in parallel"),
+    ("E1 b 0 a 0 2\nE2 c b a 0 2\nE3 c 0 a 0 1", 6, "E3 closes a loop of voltage sources with"),
+    ("E1 b 0 q 0 2\nR2 b 0 1k", 4, "E1 names the node 'q'; allowed: a node that some element touches"),
+    ("E1 b 0 a 2\nR2 b 0 1k", 4, "missing value: a controlled voltage source is written E1 node node node node value"),
+    ("E1 b 0 POLY(1) a 0 0 2\nR2 b 0 1k", 4, "E1 is given by POLY"),
+    ("E1 b 0 VALUE={V(a)*2}\nR2 b 0 1k", 4, "E1 is given by VALUE"),
+    ("G1 0 b a 0 x\nR2 b 0 1k", 4, "G1 gm is 'x'"),
+    ("G1 0 b a 0 1m", 4, "node 'b' is floating: only G1 touches it"),
+    ("F1 0 b R1 2\nR2 b 0 1k", 4, "F1 names the source 'r1'; allowed: a V element"),
+    ("H1 b 0 V2 2\nR2 b 0 1k", 4, "H1 names the source 'v2'; allowed: a V element, of 0 V where only its current counts; is 'v1' meant?"),
+    ("Vs a b 0\nC1 b 0 1n\nH1 c 0 Vs 1k\nC2 c 0 1n", 6, "H1 would set the voltage of a capacitor by the current of a"),
+    ("R2 a b 1k\nC1 b 0 1n\nE1 e 0 b 0 3\nC2 e b 1n", 6, "behind E1 a node has no capacitance, or less than none"),
+    ("L1 a 0 -1m", 4, "L1 value is -1m (-0.001 H); allowed: more than 0"),
+    ("L1 a 0 0", 4, "L1 value is 0 H; allowed: more than 0"),
+    ("L1 a b 1m\nL2 b 0 1m", 4, "L1 is an inductor without a path: node 'b' is reached through current sources and"),
+    ("L1 a 0 1m\nL2 b 0 1m\nR2 b 0 1\nK1 L1 L2 1.2", 7, "K1 k is 1.2; allowed: more than 0, from 1e-30 to 1"),
+    ("L1 a 0 1m\nL2 b 0 1m\nR2 b 0 1\nK1 L1 L3 0.5", 7, "K1 names the inductor 'l3'; allowed: an L element"),
+    ("L1 a 0 1m\nK1 L1 L1 0.5", 5, "K1 couples an inductor with itself"),
+    ("L1 a 0 1m\nL2 a 0 1m\nK1 L1 L2 0.5\nK2 L2 L1 0.6", 7, "K2 couples L2 and L1, which are coupled already"),
+    ("L1 a 0 1\nL2 a 0 1\nL3 a 0 1\nK1 L1 L2 0.9\nK2 L2 L3 0.9", 8, "the couplings exclude each other"),
+    ("K1 L1 L2 0.5", 4, "K1 names the inductor 'l1'"),
+    ("L1 a 0 1\nL2 b 0 4\nK1 L1 L2 1\nC1 b 0 1n", 4, "the equations of L1 have no solution"),
+    ("S1 a b a 0 sw\nR2 b 0 1k", 4, "S1 names the .model 'sw', which is missing"),
+    ("S1 a b a 0\nR2 b 0 1k", 4, "missing model: a switch is written S1 node node node node model"),
+    ("R2 a c 1\nC1 c 0 1u\nS1 a b c 0 sw\nR3 b 0 1k\n.model sw SW(Vt=1)", 6,
+     "S1 is controlled by 'c'; allowed: the nodes of a V element, whose voltage is known beforehand"),
+    ("S1 a b a 0 sw\nR2 b 0 1k\n.model sw SW(Ron=0)", 6, "S1 ron is 0 ohm; allowed: more than 0"),
+    ("S1 a b a 0 sw\nR2 b 0 1k\n.model sw SW(Rin=1)", 6, "S1: S has no parameter 'rin'; did you mean 'ron'?"),
+    ("S1 a b a 0 sw\nR2 b 0 1k\n.model sw NMOS(Vt=1)", 6, "'.model sw NMOS(Vt=1)' is not supported; allowed: .model NAME SW"),
+    ("M1 a 0 0 0 nm", 4, "'M1' is a transistor, which is not supported: use E or G for an amplifier in its linear range"),
+    ("D1 a 0 dm", 4, "'D1' is a diode, which is not supported: use an R, or as a source the voltage behind it"),
+    ("B1 b 0 V=V(a)", 4, "use E, F, G or H, which are linear"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("lines", "line", "said"), BAD, ids=[said[:40] for _, _, said in BAD])
+def test_what_is_wrong_is_a_sentence_with_its_line(lines: str, line: int, said: str) -> None:
+    with pytest.raises(fs.InputError) as caught:
+        parse(f"{HEAD}{lines}\n.tran 1u 1m uic")
+    assert said in str(caught.value)
+    assert f"<netlist>:{line}:" in str(caught.value)
+
+
+def test_a_start_at_an_operating_point_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(fs.InputError, match="no DC operating point: nothing determines L1, in a loop of inductors"):
+        fs.simulate(parse(f"{HEAD}L1 a 0 1m\n.tran 1u 1m"))
+    with pytest.raises(fs.InputError, match="no DC operating point: nothing determines C1"):
+        fs.simulate(parse(f"{HEAD}C1 a b 1n\nC2 b 0 1n\nG1 0 c a 0 1\nR2 c d 1\nL1 d 0 1m\n.tran 1u 1m"))
