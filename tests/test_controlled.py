@@ -25,14 +25,14 @@ DECKS = {
                            "Cx x 0 160p\nE1 out 0 x 0 1\nRout out top 10k\n.tran 1u 3m uic\n", ["out", "x"], 2e-7),
     "transformer": ("Vin in 0 SIN(0 10 1k)\nR1 in p 1\nL1 p 0 10m\nL2 s 0 4\nK1 L1 L2 0.999\nR2 s top 1k\n"
                     ".tran 1u 2m uic\n", ["p", "s"], 3e-8),
-    "currents": ("Vin in 0 SIN(0 200 1k)\nR0 in b 100k\nVs b c 0\nR5 c top 1\nRc c 0 200k\nF1 0 mon Vs 2\nR1 mon 0 10k\n"
-                 "C1 mon 0 1n\nH1 h 0 Vs 50k\nR3 h f 1k\nC3 f 0 10n\n.tran 1u 3m uic\n", ["mon", "f"], 1e-7),
+    "currents": ("Vin in 0 SIN(0 200 1k)\nR0 in b 100k\nVs b c 0\nR5 c top 1\nRc c 0 200k\nF1 0 mon Vs 2\nR1 mon 0 9k\n"
+                 "C1 mon 0 1n\nH1 h 0 Vs 50k\nR3 h f 1k\nC3 f 0 9n\n.tran 1u 3m uic\n", ["mon", "f"], 1e-7),
     "boost": ("Vdc in 0 5\nVc c 0 PULSE(0 5 1u 0.2n 0.2n 7u 10u)\nL1 in y 100u\nR0 y x 0.5\nS1 x 0 c 0 low\n"
               "S2 x o 0 c high\nC1 o 0 1u\nR1 o 0 1k\nR2 o top 10k\n.model low SW(Ron=0.2 Roff=1meg Vt=2.5 Vh=0)\n"
               ".model high SW(Ron=0.2 Roff=1meg Vt=-2.5)\n.tran 1u 0.2m uic\n", ["o", "x"], 5e-9),
-    "H-bridge": ("Vdc p 0 100\nVa a 0 PULSE(0 5 0 0.2n 0.2n 100u 200u)\nS1 p x a 0 on\nS2 x 0 a 0 off\n"
-                 "S3 p y a 0 off\nS4 y 0 a 0 on\nR1 x m 20k\nL1 m top 10m\nR9 y q 100\nC9 q 0 1n\n"
-                 ".model on SW(Ron=10 Roff=100meg Vt=2.5 Vh=0.5)\n.model off SW Ron=100meg Roff=10 Vt=2.5 Vh=0.5\n"
+    "H-bridge": ("Vdc p 0 100\nVc c 0 PULSE(0 5 0 0.2n 0.2n 100u 200u)\nS1 p x c 0 high\nS2 x 0 c 0 low\n"
+                 "S3 p y c 0 low\nS4 y 0 c 0 high\nR1 x m 20k\nL1 m top 10m\nR9 y q 100\nC9 q 0 1n\n"
+                 ".model high SW(Ron=10 Roff=100meg Vt=2.5 Vh=0.5)\n.model low SW Ron=100meg Roff=10 Vt=2.5 Vh=0.5\n"
                  ".tran 1u 0.5m uic\n", ["x", "top"], 5e-9),
 }  # fmt: skip
 
@@ -70,16 +70,17 @@ def test_drivers_of_a_finger_agree_with_ngspice(name: str, law: str) -> None:
 
 def inside_edges(text: str, t: np.ndarray) -> np.ndarray:
     """Times beside an edge of a pulse, in which switches change here and at ngspice's next step there."""
-    edges = [e.waveform.breakpoints(0.0, 1.0) for e in fs.parse_netlist(text).by_device("V") if "PULSE" in text]
-    near = np.unique(np.concatenate([*edges, [-1.0]]))
-    return np.abs(t - near[np.abs(t[:, None] - near).argmin(axis=1)]) < 1.1e-8
+    pulses = [e.waveform for e in fs.parse_netlist(text).by_device("V") if isinstance(e.waveform, fs.Pulse)]
+    edges = np.unique(np.concatenate([[-1.0, 1.0], *(wave.breakpoints(0.0, t[-1]) for wave in pulses)]))
+    after = edges.searchsorted(t)
+    return np.minimum(edges[after] - t, t - edges[after - 1]) < 1.1e-8
 
 
 @every_law
 @pytest.mark.parametrize("name", DECKS)
 def test_stated_errors_are_met(name: str, law: str) -> None:
     circuit = fs.parse_netlist(with_charge_law(deck(name), law))
-    fine = fs.simulate(circuit, rtol=1e-12)
+    fine = fs.simulate(circuit, rtol=1e-11)
     for rtol in (1e-4, 1e-8):
         run = fs.simulate(circuit, rtol=rtol)
         assert np.abs(run.u_gap - fine.u_gap).max() <= run.error.u_gap + fine.error.u_gap
@@ -150,7 +151,9 @@ def test_phasors_are_those_of_the_closed_forms() -> None:
     s = 2j * np.pi * f
     rlc = fs.phasor(parse("V1 a 0 AC 1\nR1 a b 10\nL1 b c 1m\nC1 c 0 1u"), f)
     np.testing.assert_allclose(rlc.impedance, 10.0 + 1e-3 * s + 1e6 / s, rtol=1e-12)
-    amplifier = fs.phasor(parse("V1 in 0 AC 1\nR1 in m 10k\nR2 m out 1meg\nC2 m out 10p\nE1 out 0 0 m 1e5\nR3 out 0 1k"), f)
+    amplifier = fs.phasor(
+        parse("V1 in 0 AC 1\nR1 in m 10k\nR2 m out 1meg\nC2 m out 10p\nE1 out 0 0 m 1e5\nR3 out 0 1k"), f
+    )
     ratio = 1.0 / (1e-6 + 1e-11 * s) / 1e4
     gain = amplifier.v_nodes[:, amplifier.nodes.index("out")]
     np.testing.assert_allclose(gain, -ratio / (1.0 + (1.0 + ratio) / 1e5), rtol=1e-12)
@@ -177,9 +180,9 @@ def test_a_source_that_follows_another_keeps_the_exponential_steps(law: str) -> 
 
 
 def test_elements_of_subcircuits_control_those_beside_them() -> None:
-    body = "Vs p q 0\nF1 0 out Vs {gain}\nRs q 0 1k\nL1 q x 1m\nL2 out y 1m\nK1 L1 L2 0.5\nRx x 0 50\nRy y 0 50\nRo out 0 1k"
-    circuit = parse(f"V1 in 0 SIN(0 1 1k)\n.subckt mirror p out gain=1\n{body}\n.ends\nX1 in a mirror gain=2\nX2 in b mirror\n"
-                    ".tran 5u 1m uic")  # fmt: skip
+    body = "Vs p q 0\nF1 0 out Vs {gain}\nRs q 0 1k\nL1 q x 1m\nL2 out y 1m\nK1 L1 L2 0.5\nRx x 0 50\nRy y 0 50"
+    calls = "X1 in a mirror gain=2\nX2 in b mirror\n.tran 5u 1m uic"
+    circuit = parse(f"V1 in 0 SIN(0 1 1k)\n.subckt mirror p out gain=1\n{body}\n.ends\n{calls}")
     assert circuit["X1.F1"].control == ("x1.vs",)
     assert circuit["X2.K1"].control == ("x2.l1", "x2.l2")
     run = fs.simulate(circuit)
@@ -208,7 +211,9 @@ def test_recordings_drive_amplifiers_by_implicit_steps() -> None:
     circuit = fs.parse_netlist(deck("op-amp"))
     run = fs.simulate(circuit, sources={"Vin": samples}, t_stop=9e-3)
     assert run.method == "radau"
-    assert fs.simulate(circuit, sources={"Vin": samples}, t_stop=9e-3, rtol=1e-10).u_gap == pytest.approx(run.u_gap, abs=1e-5)
+    assert fs.simulate(circuit, sources={"Vin": samples}, t_stop=9e-3, rtol=1e-10).u_gap == pytest.approx(
+        run.u_gap, abs=1e-5
+    )
 
 
 def test_plans_say_that_steps_are_implicit() -> None:
@@ -239,7 +244,7 @@ BAD = [
     ("G1 0 b a 0 x\nR2 b 0 1k", 4, "G1 gm is 'x'"),
     ("G1 0 b a 0 1m", 4, "node 'b' is floating: only G1 touches it"),
     ("F1 0 b R1 2\nR2 b 0 1k", 4, "F1 names the source 'r1'; allowed: a V element"),
-    ("H1 b 0 V2 2\nR2 b 0 1k", 4, "H1 names the source 'v2'; allowed: a V element, of 0 V where only its current counts; is 'v1' meant?"),
+    ("H1 b 0 V2 2\nR2 b 0 1k", 4, "H1 names the source 'v2'; allowed: a V element, of 0 V where only its"),
     ("Vs a b 0\nC1 b 0 1n\nH1 c 0 Vs 1k\nC2 c 0 1n", 6, "H1 would set the voltage of a capacitor by the current of a"),
     ("R2 a b 1k\nC1 b 0 1n\nE1 e 0 b 0 3\nC2 e b 1n", 6, "behind E1 a node has no capacitance, or less than none"),
     ("L1 a 0 -1m", 4, "L1 value is -1m (-0.001 H); allowed: more than 0"),
@@ -258,8 +263,8 @@ BAD = [
      "S1 is controlled by 'c'; allowed: the nodes of a V element, whose voltage is known beforehand"),
     ("S1 a b a 0 sw\nR2 b 0 1k\n.model sw SW(Ron=0)", 6, "S1 ron is 0 ohm; allowed: more than 0"),
     ("S1 a b a 0 sw\nR2 b 0 1k\n.model sw SW(Rin=1)", 6, "S1: S has no parameter 'rin'; did you mean 'ron'?"),
-    ("S1 a b a 0 sw\nR2 b 0 1k\n.model sw NMOS(Vt=1)", 6, "'.model sw NMOS(Vt=1)' is not supported; allowed: .model NAME SW"),
-    ("M1 a 0 0 0 nm", 4, "'M1' is a transistor, which is not supported: use E or G for an amplifier in its linear range"),
+    ("S1 a b a 0 sw\nR2 b 0 1k\n.model sw NMOS(Vt=1)", 6, "'.model sw NMOS(Vt=1)' is not supported; allowed: .model"),
+    ("M1 a 0 0 0 nm", 4, "'M1' is a transistor, which is not supported: use E or G for an amplifier in"),
     ("D1 a 0 dm", 4, "'D1' is a diode, which is not supported: use an R, or as a source the voltage behind it"),
     ("B1 b 0 V=V(a)", 4, "use E, F, G or H, which are linear"),
 ]  # fmt: skip
@@ -277,4 +282,4 @@ def test_a_start_at_an_operating_point_that_does_not_exist_is_refused() -> None:
     with pytest.raises(fs.InputError, match="no DC operating point: nothing determines L1, in a loop of inductors"):
         fs.simulate(parse(f"{HEAD}L1 a 0 1m\n.tran 1u 1m"))
     with pytest.raises(fs.InputError, match="no DC operating point: nothing determines C1"):
-        fs.simulate(parse(f"{HEAD}C1 a b 1n\nC2 b 0 1n\nG1 0 c a 0 1\nR2 c d 1\nL1 d 0 1m\n.tran 1u 1m"))
+        fs.simulate(parse(f"{HEAD}C1 a b 1n\nC2 b 0 1n\nG1 0 c b 0 1\nR2 c 0 1\n.tran 1u 1m"))

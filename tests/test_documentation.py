@@ -330,7 +330,9 @@ def test_the_table_of_parameters_is_that_of_the_devices() -> None:
     for device, entry in DEVICES.items():
         for spec in entry.parameters:
             default = "required" if spec.default is None else shown(spec.default, spec)
-            legal = ("any" if spec.least < 0.0 else ">= 0" if spec.may_be_zero else "> 0") + (" or inf" if spec.may_be_infinite else "")
+            legal = ("any" if spec.least < 0.0 else ">= 0" if spec.may_be_zero else "> 0") + (
+                " or inf" if spec.may_be_infinite else ""
+            )
             assert spec.usual is not None
             usual = f"{shown(spec.usual.least, spec)} to {shown(spec.usual.most, spec)}"
             expected[device, f"`{spec.name}`"] = [spec.unit or "1", default, legal, usual]

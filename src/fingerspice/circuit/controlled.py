@@ -80,10 +80,10 @@ def _windings(coils: Sequence[Element], couplings: Sequence[Element], c: float) 
 
 def _solved(matrix: FloatArray, right: FloatArray, size: FloatArray, elements: Sequence[Element]) -> FloatArray:
     """Solution of equations, one for each element, whose terms have these sizes; refused where there is none."""
-    inverse: FloatArray = np.full_like(matrix, np.inf)
+    inverse, cancelled = np.zeros_like(matrix), np.full(len(matrix), np.inf)
     with suppress(np.linalg.LinAlgError):
         inverse = np.asarray(np.linalg.inv(matrix), float)
-    cancelled = np.diag(np.abs(inverse) @ size) * _SINGULAR if matrix.size else np.zeros(0)
+        cancelled = np.diag(np.abs(inverse) @ size) * _SINGULAR
     if not np.all(cancelled < 1.0):
         named = [e for e, x in zip(elements, cancelled.tolist(), strict=True) if not x < 1.0]
         said = f"the equations of {', '.join(dict.fromkeys(e.name for e in named))} have no solution"

@@ -209,10 +209,10 @@ class Network(Remembering):
         y = np.asarray(y)[..., None]
         return self.k + self.cut.T @ (y * self.p), self.b + self.cut.T @ (y * self.q)
 
-    def decay(self, area: FloatArray) -> FloatArray:
-        """Real parts of the rates at which modes decay at areas (n_area,) in m^2, 1/s, negative where one grows."""
+    def decay(self, area: FloatArray) -> ComplexArray:
+        """Complex rates at which modes decay at areas (n_area,) in m^2, 1/s; where one grows the real part is < 0."""
         mass = self.cut.T @ (self.capacitance(area)[:, None] * self.p)
-        return np.asarray(np.linalg.eigvals(np.linalg.solve(mass, self.stiffness(self.leak(area))[0])).real)
+        return np.asarray(np.linalg.eigvals(np.linalg.solve(mass, self.stiffness(self.leak(area))[0])), complex)
 
     def admittances(self, frequency: ArrayLike, area: FloatArray) -> ComplexArray:
         """Complex admittance of every cell at frequencies (Hz), with SKIN's data there, S, shape (..., n_cell)."""

@@ -45,6 +45,8 @@ LOCAL_SHARE, FINEST, ROUNDED = 0.2, 1e-14, 4e-15
 PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 # They are also compared after at most so many edges of the sources, at these fractions of the time to the next edge.
 MOST_EDGES, AFTER_EDGE = 256, np.geomspace(1e-15, 0.3, 30)
+# The same for circuits whose voltages may oscillate, and how much larger their error may be between these times.
+OSCILLATING, UNSEEN = np.geomspace(1e-9, 0.3, 170), 1.5
 ATTEMPTS, TELL_AFTER = 6, 3.0  # Number of attempts, and time after which the expected time of a run is announced, s
 # Difference of a fold's times in two successive runs at which the fold is accepted at once, over its time; and the one
 # at which it is accepted after the last attempt, over its time or the source's shortest time, if that is longer.
@@ -78,6 +80,10 @@ class Collocation(Integration):
         self.scale = np.repeat([u_scale, 1.0, charge], sizes)
         self.control, self.counters = np.zeros(implicit.N_CONTROL), np.zeros(implicit.N_COUNTERS, np.int64)
         self.control[implicit.BASE] = problem.t_start
+        if problem.network.active:
+            # A step longer than the fastest mode would be tested at its end only, where that has decayed.
+            fastest = max(abs(problem.network.decay(problem.scene.net.area0)), default=math.inf)
+            self.control[[implicit.H, implicit.H_AFTER_JUMP]] = 1.0 / max(fastest, 1e-300)
         self.peaks = np.zeros(self.net.gap.size)
         self.room = new_room(self.net, self.y.size)
         self.work = new_work(self.net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
@@ -279,7 +285,8 @@ def _with_probes(problem: Problem) -> tuple[Problem, BoolArray]:
     # Transients right after an edge may decay between two equidistant times, so look at them on a logarithmic grid.
     edges = np.unique(np.append(problem.breakpoints(), [problem.t_start, problem.t_stop]))
     some = np.arange(0, edges.size - 1, math.ceil(edges.size / MOST_EDGES))
-    after = (edges[some, None] + np.diff(edges)[some, None] * AFTER_EDGE).ravel()
+    behind = OSCILLATING if problem.network.active else AFTER_EDGE
+    after = (edges[some, None] + np.diff(edges)[some, None] * behind).ravel()
     probes = np.concatenate([probes, after[after < problem.t_stop]])
     every = np.concatenate([problem.t_out, probes])
     side = np.concatenate([problem.left, ~np.isin(probes, edges)])
@@ -293,16 +300,17 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
     Returns the largest stated error relative to the peak of its gap, of voltages and forces.
     """
     gaps, fine, coarse = [], probed.record(problem), beside.record(problem)
+    more = UNSEEN if problem.network.active else 1.0
     # Between the times compared, the steps may have seen larger voltages, and forces if the area has no time constant.
     met = itertools.chain(run.gaps[:, :2].tolist(), itertools.repeat((0.0, 0.0)))
     for (u, f), (v, g), (u_met, f_met) in zip(gap_signals(fine), gap_signals(coarse), met, strict=False):
         peak, force = max(float(np.abs(u).max(initial=0.0)), u_met), max(float(f.max(initial=0.0)), f_met)
-        gaps.append((peak, force, apart(u, v), apart(f, g)))
-    run.gaps, run.node_error = np.array(gaps).reshape(-1, 4), runs.nodes_apart(fine, coarse)
+        gaps.append((peak, force, more * apart(u, v), more * apart(f, g)))
+    run.gaps, run.node_error = np.array(gaps).reshape(-1, 4), more * runs.nodes_apart(fine, coarse)
     run.add_error((alike + ROUNDED) * u_scale)
     if problem.charge:
         at = slice(problem.initial.y.size - problem.initial.s_before.size, problem.initial.y.size)
-        run.charge_error = apart(probed.rows[:, at], beside.rows[:, at])
+        run.charge_error = more * apart(probed.rows[:, at], beside.rows[:, at])
     return excess_of(run.gaps, max(ROUNDING * u_scale, problem.rounding))
 
 

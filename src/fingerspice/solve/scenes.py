@@ -92,7 +92,7 @@ class Scene(Remembering):
     def rates(self) -> FloatArray:
         """Decay rates of these modes, 1/s; of modes that may oscillate, the real parts."""
         if self.network.active:
-            return self.network.decay(self.net.area0)
+            return np.asarray(self.network.decay(self.net.area0).real)
         if self.model is None:
             return self.modes.rates
         rates, _, _, _ = modes(self.model.rate + self.model.rate0 / self.model.area0, self.model.k)
