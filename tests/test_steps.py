@@ -54,7 +54,7 @@ def test_forms_of_step(line: str, values: list[float]) -> None:
     [
         ([".step param gop 1 2 1"], "did you mean 'gap'"),
         ([".step Xgop.d 1 2 1"], "'Xgop.d' is not there"),
-        ([".step temp 0 1 1"], "nothing depends on temperature"),
+        ([".step temp 0 1 1"], "the temperature is not stepped here"),
         ([".step gap 1u 2u 0"], "has no values"),
         ([".step gap 2u 1u 1u"], "has no values"),
         ([".step gap list"], "list without values"),
@@ -232,3 +232,53 @@ def test_a_deck_without_tran(command: Command) -> None:
     assert done.code == 0
     assert "operating point" in done.out
     assert Path("out/op_dc.png").is_file()
+
+
+TEMPERATURE = """values that follow the temperature
+V1 a 0 1
+R1 a b RM 1k
+R2 b 0 2k tc1=1m tc2=10u
+R3 a c RM
+R4 c 0 1k tc1=5m
+C1 c 0 CM 1u
+.model RM R(tc1=2m tc2=-5u r=3k)
+.model CM C tc1=1m
+.temp 77
+.end
+"""
+
+
+def test_values_follow_the_temperature_as_in_ngspice(tmp_path: Path) -> None:
+    circuit = fs.parse_netlist(TEMPERATURE)
+    warm = 1.0 + 2e-3 * 50.0 - 5e-6 * 50.0**2
+    expected = {"R1": 1e3 * warm, "R2": 2e3 * (1.0 + 0.05 + 0.025), "R3": 3e3 * warm, "R4": 1250.0, "C1": 1.05e-6}
+    for name, value in expected.items():
+        assert circuit[name].values["value"] == pytest.approx(value, rel=1e-14), name
+    found = fs.operating_points(circuit)
+    control = ".control\nop\nprint v(b) v(c)\nquit 0\n.endc\n.end\n"
+    (tmp_path / "op.cir").write_text(TEMPERATURE.replace(".end\n", control))
+    said = call_ngspice(tmp_path, "op.cir").stdout
+    for node in "bc":
+        theirs = next(line for line in said.splitlines() if line.startswith(f"v({node}) = "))
+        assert found[f"v:{node}"].item() == pytest.approx(float(theirs.partition(" = ")[2]), rel=1e-6)
+    for options in ("TEMP = 77°C", "temp=102 tnom=52"):
+        again = fs.parse_netlist(TEMPERATURE.replace(".temp 77", f".options {options}"))
+        assert again["R1"].values["value"] == pytest.approx(1e3 * warm, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        (".temp 77", ".temp 77 99", "allowed: .temp 50"),
+        (".temp 77", ".options temp=warm", "allowed: a number, in °C"),
+        (".temp 77", ".temp -500", r":3:1: R1 is -1.443 times its value where it is -527 K warmer"),
+        ("RM 1k", "CM 1k", "R1 is of the model CM, which is of a C"),
+        ("RM 1k", "RX 1k", "R1 needs one value"),
+        ("R(tc1=2m", "R(tc3=2m", "R1 takes no parameter 'tc3'"),
+        ("RM R(", "RM D(", "is not supported; allowed: .model NAME SW"),
+        ("R3 a c RM", "R3 a c CX", "R3 value is 'CX'; allowed: a number ohm"),
+    ],
+)
+def test_bad_temperatures_and_models(before: str, after: str, said: str) -> None:
+    with pytest.raises(fs.InputError, match=said):
+        fs.parse_netlist(TEMPERATURE.replace(before, after))

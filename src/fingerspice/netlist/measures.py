@@ -334,7 +334,7 @@ def _stepped(words: _Line) -> Step:
     """The next word as what is stepped, without its values."""
     place, written = words.where, words.take("what is stepped")[1]
     key = written.lower()
-    refuse(key == "temp", f"{words.name} temp: nothing depends on temperature here; allowed: a .param, or R1", place)
+    refuse(key == "temp", f"{words.name} temp: the temperature is not stepped here; allowed: a .param, or R1", place)
     if key in words.params and not key.endswith("("):
         return Step(key, (), True)
     known = {f"{e.name}.{name}".lower(): f"{e.name}.{name}" for e in words.elements for name in e.parameters}

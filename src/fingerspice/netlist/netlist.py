@@ -26,6 +26,8 @@ from fingerspice.netlist.reader import MAX_WARNINGS, OTHERS, Context, Deck, Stat
 from fingerspice.netlist.sources import read_source
 from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
 
+_REFERENCE = 27.0  #: Temperature (°C) at which values are meant.
+_MODELLED = {"SW": "S", "R": "R", "RES": "R", "C": "C", "CAP": "C"}  #: Types of models, each with its element.
 _COPIES = "m"  #: The parameter that gives the number of equal parts in parallel.
 LTSPICE_OUTPUTS = 10_000  #: Number of outputs of a run whose .tran has no TSTEP.
 _NGSPICE_OPTIONS, _LTSPICE_OPTIONS = (OTHERS["options"][name].split() for name in ("ngspice", "ltspice"))
@@ -87,7 +89,7 @@ def _circuit(deck: Deck) -> Circuit:
 def _read(deck: Deck, notes: list[str]) -> Circuit:
     tran = next((read_tran(directive, notes) for directive in deck.directives[".tran"]), None)
     models = read_models(deck.directives[".model"])
-    context = Context(tran, None if deck.path is None else deck.path.parent, models=models)
+    context = Context(tran, None if deck.path is None else deck.path.parent, models=models, warmer=_warmer(deck))
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.directives[".options"])
     initial, unused_starts = read_start(deck.directives[".ic"], elements, tran is None or tran.uic)
@@ -216,7 +218,8 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
     elif device == "S":
         values = _device_values(_modelled(own, context), None, notes)
     elif DEVICES[device].cells is None:
-        values, read["initial"] = _read_passive(own, notes)
+        own = _of_model(own, context) if device in "RC" else own
+        values, read["initial"] = _read_passive(own, context.warmer, notes)
     else:
         if device == "GAP" and "law" in own.params:
             read["law"] = _law(own)
@@ -243,17 +246,57 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
 
 
 def read_models(directives: list[Call]) -> dict[str, Call]:
-    """``.model NAME SW(key=value ...)``, brackets or not: the type with its parameters by name in lower case."""
+    """``.model NAME SW(key=value ...)``, brackets or not, and of R and C: parameters by name in lower case."""
     out: dict[str, Call] = {}
     for one in directives:
         name, kind = (*one.args, None, None)[:2]
-        usage = "allowed: .model NAME SW(Ron=1 Roff=1meg Vt=2.5 Vh=0)"
-        known = isinstance(name, Token) and kind is not None and len(one.args) == 2 and kind.text.upper() == "SW"
-        if not known or not isinstance(name, Token):
+        usage = "allowed: .model NAME SW(Ron=1 Roff=1meg Vt=2.5 Vh=0), .model NAME R(tc1=1m tc2=1u), or C"
+        device = _MODELLED.get(kind.text.upper()) if kind is not None and len(one.args) == 2 else None
+        if device is None or not isinstance(name, Token):
             raise InputError(f"{one.line.strip()!r} is not supported; {usage}", one.where)
         refuse(name.text.lower() in out, f".model {name.text} is given twice", one)
-        out[name.text.lower()] = Call("SW", (), kind.params if isinstance(kind, Call) else one.params, one.where)
+        out[name.text.lower()] = Call(device, (), kind.params if isinstance(kind, Call) else one.params, one.where)
     return out
+
+
+def _of_model(statement: Statement, context: Context) -> Statement:
+    """The statement of an R or C with the parameters of the model that it may name, of which its own come first."""
+    words = [word for word in statement.body if isinstance(word, Token) and word.text.lower() in context.models]
+    for word in words:
+        model = context.models[word.text.lower()]
+        wrong = model.text != statement.device or len(words) > 1
+        refuse(wrong, f"{statement.name} is of the model {word.text}, which is of a {model.text}", word)
+        body = tuple(one for one in statement.body if one is not word)
+        own = {key: part for key, part in model.params.items() if not (body and key == statement.device.lower())}
+        statement = statement._replace(body=body, params=own | statement.params)
+    return statement
+
+
+def _warmed(statement: Statement, warmer: float) -> float:
+    """The factor on a value whose coefficients are `tc1` (1/K) and `tc2` (1/K^2), warmer than the reference by K."""
+    name, params = statement.name, statement.params
+    first, second = (number(params[key], f"{name} {key}").value if key in params else 0.0 for key in ("tc1", "tc2"))
+    factor = 1.0 + first * warmer + second * warmer**2
+    said = f"{name} is {factor:.4g} times its value where it is {warmer:g} K warmer; allowed: more than 0"
+    refuse(not factor > 0.0, said, statement)
+    return factor
+
+
+def _warmer(deck: Deck) -> float:
+    """How much warmer the deck is than its values' reference, by `.temp` and the options `temp` and `tnom`, K."""
+    found = {"temp": _REFERENCE, "tnom": _REFERENCE}
+    for key, value in [pair for one in deck.directives[".options"] for pair in one.params.items() if pair[0] in found]:
+        # PySpice writes its unit, too.
+        plain = value.text.lower().removesuffix("c").removesuffix("°")
+        try:
+            found[key] = value.value if isinstance(value, Number) else float(plain)
+        except ValueError:
+            raise InputError(f".options {key} is {value.text!r}; allowed: a number, in °C", value.where) from None
+    for one in deck.directives[".temp"]:
+        values, words = _numbers(one, ".temp 50")
+        refuse(len(values) != 1 or words, f"{one.line.strip()!r} is not understood; allowed: .temp 50, in °C", one)
+        found["temp"] = values[0].value
+    return found["temp"] - found["tnom"]
 
 
 def _modelled(statement: Statement, context: Context) -> Statement:
@@ -299,7 +342,7 @@ def _device_values(statement: Statement, law: ContactLaw | None, notes: list[str
     return values
 
 
-def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
+def _read_passive(statement: Statement, warmer: float, notes: list[str]) -> tuple[dict[str, float], float | None]:
     """The one value of an element, and the start voltage (V) of a C or current (A) of an L."""
     name, device, params = statement.name, statement.device, statement.params
     kind, (spec,) = DEVICES[device], DEVICES[device].parameters
@@ -319,6 +362,7 @@ def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, flo
         if not isinstance(copies, Number) or not 1e-6 <= copies.value <= 1e6:
             raise InputError(f"{name} m is {copies.text!r}; allowed: a number of parts side by side", copies.where)
         value = value * copies.value if device == "C" else value / copies.value
+    value *= _warmed(statement, warmer) if device in "RCL" else 1.0
     return {spec.name: value}, start_volts(f"{name} IC", params["ic"]) if "ic" in params else None
 
 
@@ -465,6 +509,8 @@ def read_options(directives: list[Call]) -> tuple[str, tuple[str, ...]]:
                     raise InputError(f".options work is {text!r}; allowed: {' or '.join(WORK_READINGS)}", place)
                 refuse(work not in (None, text), f".options work is given twice, first {work}, then {text}", place)
                 work = text
+            elif key in ("temp", "tnom"):
+                continue
             elif key in _NGSPICE_OPTIONS or key in _LTSPICE_OPTIONS:
                 unused.append(f".options {key}")
             else:

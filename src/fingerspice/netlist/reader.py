@@ -96,6 +96,7 @@ class Context:
     folder: Path | None = None  # Folder of the deck; None for a deck given as text
     in_deck: bool = True  # Whether the source stands in a deck, which a SPICE may read, too
     models: Mapping[str, Call] = field(default_factory=dict)  # By name in lower case
+    warmer: float = 0.0  # Than the temperature at which values are meant, K
     anywhere: bool = False  # Whether any file may be read, relative to the working directory: for a user's own sources
     size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
 
@@ -191,7 +192,8 @@ MAX_INCLUDE_DEPTH = 32
 
 _USED = (
     ".tran", ".ac", ".op", ".dc", ".step", ".meas", ".measure", ".four", ".save", ".probe", ".print", ".options", ".ic",
-    ".param", ".func", ".global", ".subckt", ".ends", ".include", ".inc", ".lib", ".endl", ".model", ".control", ".end",
+    ".param", ".func", ".global", ".subckt", ".ends", ".include", ".inc", ".lib", ".endl", ".model", ".temp",
+    ".control", ".end",
 )  # fmt: skip
 _UNUSED = (".plot", ".title")
 #: Every directive that may stand in a deck; `Deck._direct` says what is done with it.
@@ -318,7 +320,7 @@ class Deck:
         """Do what a directive asks for, whose arguments begin at a position of its line."""
         here, place, text = self._open[-1], line.where(), line.text[rest:]
         match name:
-            case ".tran" | ".ac" | ".option" | ".options" | ".ic" | ".model":
+            case ".tran" | ".ac" | ".option" | ".options" | ".ic" | ".model" | ".temp":
                 opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
                 refuse(here is not self.root and name != ".ic", f"{name} does not belong inside {opened}?", place)
                 if name in (".tran", ".ac"):
