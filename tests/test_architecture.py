@@ -75,8 +75,8 @@ LENT = {
 THIRD_PARTY = {
     "numerics": {"numpy", "numba"}, "physics": {"numpy", "numba"}, "engine": {"numpy", "numba"}, "circuit": {"numpy"},
     "circuit.laws": {"numpy", "scipy"}, "physics.laws": {"numpy", "scipy"},
-    "netlist": {"numpy"}, "sets": set(), "base": {"numba", "llvmlite", "numpy", "rich"}, "base.errors": set(), "base.units": set(),
-    "base.files": set(),
+    "netlist": {"numpy"}, "sets": set(), "base": {"numba", "llvmlite", "numpy", "rich"}, "base.errors": set(),
+    "base.units": set(), "base.files": set(),
 }  # fmt: skip
 
 
