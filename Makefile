@@ -5,7 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 DECK ?= circuits/fingerpad.cir
 
-.PHONY: run test check docs figures fuzz stress clean
+# Levels of instructions for which `make wheel` compiles.
+LEVELS ?= $(if $(filter x86_64,$(shell uname -m)),x86-64-v3 x86-64-v2,generic)
+
+.PHONY: run wheel test check docs figures fuzz stress clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -34,6 +37,14 @@ $(VENV)/.docs: pyproject.toml | $(BIN)/python
 
 run: $(VENV)/.run
 	$(BIN)/fingerspice run $(DECK) --out out
+
+# A wheel with all compiled code (docs/installing.md), out/dist/*.whl; three minutes a level on two cores.
+wheel: $(VENV)/.run
+	rm -rf out/objects out/dist
+	for level in $(LEVELS); do echo "compiling for $$level ..."; NUMBA_CACHE_DIR=out/objects \
+	    NUMBA_CPU_NAME=$$level NUMBA_CPU_FEATURES= $(BIN)/fingerspice warm || exit 1; done
+	OBJECTS=out/objects $(BIN)/pip wheel --quiet --no-deps --wheel-dir out/dist .
+	@ls -l out/dist
 
 figures: $(VENV)/.run
 	$(BIN)/fingerspice figures --out out

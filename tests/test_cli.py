@@ -214,7 +214,10 @@ def test_export_writes_one_deck_with_the_changes_in_it(command: Command) -> None
     assert "* fingerspice_mobile.lib - " in Path("sub/y.cir").read_text()
 
 
-@pytest.mark.parametrize("name", ["run", "ac", "compare", "export", "figures", "explore", "sets", "help-deck", "check"])
+NAMES = "run ac compare export figures explore sets help-deck check warm"
+
+
+@pytest.mark.parametrize("name", NAMES.split())
 def test_help_of_every_command_shows_an_example(command: Command, name: str) -> None:
     for flag in ("--help", "-h"):
         result = command(name, flag)

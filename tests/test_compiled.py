@@ -3,24 +3,26 @@
 import importlib
 import inspect
 import os
+import platform
 import re
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 import pytest
 from numba import njit
 
 import fingerspice as fs
 from fingerspice.base.announcing import LONG
-from fingerspice.base.compiled import borrow
+from fingerspice.base.compiled import LEVELS, borrow
 from processes import ended, no_room, start
 
 faults = pytest.mark.skipif(sys.platform != "linux", reason="faults are made by Linux's means")
@@ -68,13 +70,18 @@ def copy(tmp_path: Path) -> Iterator[Path]:
 
 
 def begun(
-    copy: Path, *arguments: str, code: str = AREA, cache: str | None = None, **options: Any
+    copy: Path,
+    *arguments: str,
+    code: str = AREA,
+    cache: str | None = None,
+    more: Mapping[str, str] = {},
+    **options: Any,
 ) -> subprocess.Popen[str]:
     """The code in a process that finds the package there; the user has no folder for a cache but `cache`."""
     home = str(copy / "__init__.py" / "no")
     hidden = {"PYTHONPATH": str(copy.parent), "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | hidden
-    environment |= {} if cache is None else {"NUMBA_CACHE_DIR": cache}
+    environment |= more if cache is None else {"NUMBA_CACHE_DIR": cache}
     return start(copy, *arguments, entry=[sys.executable, "-c", code], env=environment, **options)
 
 
@@ -110,6 +117,64 @@ def test_compiled_code_that_came_with_the_package_is_used_where_nothing_can_be_w
     for path in copy.rglob("*.py"):
         os.utime(path, (1e9, 1e9))
     assert area(copy, code=SHUT + LOGGED + AREA) == (0, [], first[2])
+
+
+LEVEL = {"NUMBA_CPU_NAME": "x86-64-v2", "NUMBA_CPU_FEATURES": ""}
+levels = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="levels of x86-64")
+
+
+@pytest.fixture
+def came(copy: Path) -> Path:
+    """The package with code for x86-64-v2 that came with it, as in a wheel."""
+    assert area(copy, more=LEVEL)[0] == 0
+    (copy / "objects").mkdir()
+    for file in compiled(copy):
+        file.rename(copy / "objects" / file.name)
+    return copy
+
+
+def features(*without: str) -> dict[str, str]:
+    """An environment in which the processor has what x86-64-v2 asks for, but for some."""
+    has = sorted(LEVELS["x86-64-v2"].difference(without))
+    return {"NUMBA_CPU_NAME": "nocona", "NUMBA_CPU_FEATURES": ",".join(f"+{name}" for name in has)}
+
+
+@levels
+def test_a_processor_takes_code_for_a_level_of_instructions_that_it_has_and_no_other(came: Path) -> None:
+    value = area(came, more=LEVEL)[2]
+    # This processor, one without AVX, and the level itself, which another processor's name stands for.
+    for more in ({}, features(), LEVEL):
+        assert area(came, code=LOGGED + AREA, more=more) == (0, [], value)
+    code, (said,), out = area(came, code=LOGGED + AREA, more=features("popcnt"))
+    assert (code, float(out)) == (0, pytest.approx(float(value), rel=1e-14))
+    tag = f"{sys.implementation.cache_tag}-numba-{numba.__version__}"
+    assert said == f"{ONCE}; the compiled code that came with the package is for other processors, arguments or sources"
+    other = "import numba; numba.__version__ = '0.68.99'\n"
+    code, (said,), out = area(came, code=other + LOGGED + AREA)
+    assert (code, said) == (0, f"{ONCE}; the compiled code that came with the package is for {tag}")
+    assert float(out) == pytest.approx(float(value), rel=1e-14)
+
+
+def test_half_written_and_damaged_code_is_compiled_again(copy: Path) -> None:
+    expected = area(copy)
+    for spoil in (lambda x: x[: len(x) // 2], lambda x: b"", lambda x: x[:300] + bytes(len(x) - 300), _without_code):
+        files = compiled(copy)
+        for file in files:
+            file.write_bytes(spoil(file.read_bytes()))
+        assert area(copy, code=LOGGED + AREA) == (0, [ONCE], expected[2])
+        assert area(copy, code=LOGGED + AREA) == (0, [], expected[2])
+
+
+def _without_code(data: bytes) -> bytes:
+    """As if the disk had lost a block in the middle of the object code."""
+    at = data.index(b"\x7fELF") + 200
+    return data[:at] + bytes(100) + data[at + 100 :]
+
+
+def test_two_processes_that_fill_one_cache_at_once_keep_code_that_works(copy: Path) -> None:
+    both = [ended(one) for one in [begun(copy, code=LOGGED + AREA) for _ in range(2)]]
+    assert [(code, lines) for code, lines, _ in both] == [(0, [ONCE])] * 2
+    assert area(copy, code=LOGGED + AREA) == (0, [], both[0][2])
 
 
 @faults
@@ -281,7 +346,7 @@ PRIVATE = """
 import sys
 import numpy as np
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.base.compiled import borrow
+from fingerspice.base.compiled import LEVELS, borrow
 
 @jit_within
 def inner(x):

@@ -56,9 +56,9 @@ LEVELS = {
     "x86-64-v2": _V2,
     "generic": {"neon"},
 }
-#: Folder of the compiled code that came with the package, and in it the one for this interpreter and compiler.
-CAME = _PACKAGE / "objects"
-TAG = f"{sys.implementation.cache_tag}-numba-{numba_version}"
+#: Folder of the compiled code that came with the package.
+_CAME = _PACKAGE / "objects"
+_MADE_BY = f"{sys.implementation.cache_tag}-numba-{numba_version}"
 _COMPILER = Compiling()
 
 
@@ -66,7 +66,7 @@ def _drop_stale_cache() -> None:
     """Delete cached code in the package that no name fits any more."""
     with suppress(OSError):
         for file in (_OWN.parent / "__pycache__").glob("*.nbc"):
-            if not file.name.startswith(STAMP[:12]):
+            if STAMP[:12] not in file.name:
                 file.unlink(missing_ok=True)
 
 
@@ -79,14 +79,14 @@ def _kept() -> Any:
 
 
 def cache_folder() -> str | None:
-    """The folder where compiled code is kept; None if none can be written."""
+    """Folder where compiled code is kept; None if none can be written."""
     return None if _kept() is None else str(_kept().locator.get_cache_path())
 
 
 @cache
 def _folders() -> list[Any]:
     """Folders of compiled code: where it is kept, this file's, and the one that came with the package."""
-    folders = [p for p in (cache_folder(), _OWN.parent / "__pycache__", CAME / TAG) if p is not None]
+    folders = [p for p in (cache_folder(), _OWN.parent / "__pycache__", _CAME) if p is not None]
     return [cast(Any, IndexDataCacheFile)(str(p), "", "") for p in folders]
 
 
@@ -98,9 +98,9 @@ def _source(file: str) -> str:
 
 def _why() -> str:
     """Why the code that came with the package, if there is any, is not used."""
-    came = sorted(p.name for p in CAME.glob("*"))
-    other = f"is for {', '.join(came)}" if TAG not in came else "is for other processors, arguments or sources"
-    return f"; the compiled code that came with the package {other}" if came else ""
+    came = sorted({file.name.partition("--")[0] for file in _CAME.glob("*.nbc")})
+    other = "other processors, arguments or sources" if _MADE_BY in came else ", ".join(came)
+    return f"; the compiled code that came with the package is for {other}" if came else ""
 
 
 class _Cache(NullCache):
@@ -117,16 +117,14 @@ class _Cache(NullCache):
 
     def _files(self, sig: Any, codegen: Any) -> Iterator[str]:
         code = self._function.__code__
-        key = hashlib.sha256(repr((TAG, STAMP, sig, code.co_code, _source(code.co_filename))).encode())
+        key = hashlib.sha256(repr((_MADE_BY, STAMP, sig, code.co_code, _source(code.co_filename))).encode())
         triple, cpu, features = codegen.magic_tuple()
         # A processor's name stands for tuning as well; only its instruction sets matter.
-        levels = [
-            name for name, needed in LEVELS.items() if needed <= {x[1:] for x in features.split(",") if x[0] == "+"}
-        ]
-        for target in [(cpu, features), *((level, "") for level in levels)]:
+        has = {x[1:] for x in features.split(",") if x.startswith("+")}
+        for target in [(cpu, features), *((level, "") for level, needed in LEVELS.items() if needed <= has)]:
             whole = key.copy()
             whole.update(repr((triple, target)).encode())
-            yield f"{STAMP[:12]}-{self._name}-{whole.hexdigest()[:32]}.nbc"
+            yield f"{_MADE_BY}--{STAMP[:12]}--{self._name}--{whole.hexdigest()[:24]}.nbc"
 
     def load_overload(self, sig: Any, context: Any) -> Any:
         """The code for a signature; None where it has to be compiled, which is announced."""
