@@ -9,7 +9,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.netlist.reader import LIBRARIES, shipped_text
-from ngspice_tools import CIRCUITS, call_ngspice, run_ngspice, with_charge_law
+from ngspice_tools import CIRCUITS, beside, call_ngspice, run_ngspice, with_charge_law
 from random_decks import NETWORKS, SOURCES
 from random_decks import deck as random_deck
 from scenes import DECKS as OTHERS
@@ -26,38 +26,21 @@ JUMPS = ("jump", "pwl", "repeat", "square", "pulse")
 def deviation(
     circuit: fs.Circuit, law: str | None = None, text: str = "", max_step: float | None = None, after: float = 0.0
 ) -> tuple[float, float]:
-    """Largest differences from ngspice at its own times, beside the edges, which take up to 1 ns there.
+    """Largest differences from ngspice, which runs `text`, or the exported deck.
 
     That of a gap voltage (of node voltages without a GAP) over its peak; and that of a node's voltage over the
-    largest of all, or of an area over 35 mm^2. It runs `text`, or the exported deck, and is compared from `after` (s)
-    on: its first steps do not become shorter with its largest one.
+    largest of all, or of an area over 35 mm^2.
     """
-    layers = [e for e in circuit.elements if e.spec.is_layer]
-    areas = {e.node_names[2]: e for e in layers}
-    named = {name: node for e in circuit.elements for node, name in zip(e.nodes[:2], e.node_names[:2], strict=True)}
-    nodes = [name for name, node in named.items() if node != "0" and name not in areas]
-    shown = {name: f"v({name if text else name.replace('.', '_')})" for name in (*nodes, *areas)}
-    theirs = run_ngspice(text or fs.export_netlist(circuit, charge_law=law), list(shown.values()), max_step)
-    t, first = np.unique(np.minimum(theirs["time"], circuit.tran.stop), return_index=True)
-    waves = [e.waveform for e in circuit.by_device("V", "I") if e.waveform is not None]
-    edges = np.concatenate([np.zeros(1), *(wave.breakpoints(0.0, t[-1]) for wave in waves)])
-    away = (np.abs(t[:, None] - edges[None, :]).min(axis=1) > 3e-9) & (t >= after)
-    assert away.sum() > 500
     # Lanes, which recordings would take, are compiled for every number of modes.
     method = "exponential" if circuit.by_device("GAP") else "auto"
-    ours = fs.simulate(circuit, charge_law=law, t_eval=t[away], rtol=1e-9, method=method)
-    voltages = {name.lower(): v for name, v in ours.node_voltages.items()}
-    there = {name: theirs[signal][first][away] for name, signal in shown.items()} | {"0": 0.0}
-    peak = max(np.abs(v).max() for v in voltages.values())
-    worst = max(float(np.abs(voltages[name.lower()] - there[name]).max() / peak) for name in nodes)
-    if ours.u_gap is None:
+    run, nodes, u_gap, area = beside(circuit, text, law, max_step=max_step, after=after, rtol=1e-9, method=method)
+    assert run.t.size > 500
+    peak = max(np.abs(ours).max() for ours, _ in nodes.values())
+    worst = max(float(np.abs(ours - theirs).max() / peak) for ours, theirs in nodes.values())
+    if u_gap is None:
         return worst, worst
-    gap_worst, areas_of, voltages_of = 0.0, np.atleast_2d(ours.area.T), np.atleast_2d(ours.u_gap.T)
-    for gap, area, own in zip(circuit.by_device("GAP"), areas_of, voltages_of, strict=True):
-        worst = max(worst, float(np.abs(1e6 * area - there[gap.node_names[2]]).max() / 35.0))
-        p, n = ("0" if node == "0" else name for node, name in zip(gap.nodes[:2], gap.node_names[:2], strict=True))
-        gap_worst = max(gap_worst, float(np.abs(own - (there[p] - there[n])).max() / np.abs(own).max()))
-    return gap_worst, worst
+    off = np.abs(run.u_gap - u_gap).max(axis=0) / np.abs(run.u_gap).max(axis=0)
+    return float(np.max(off)), max(worst, float(np.abs(1e6 * run.area - area).max() / 35.0))
 
 
 STACKS = ["fingerpad", "fingerpad_5khz", "fingerpad_square", "fingerpad_square_5khz", "fingerpad_dispersive"]
@@ -105,7 +88,7 @@ def test_other_circuits_agree_with_their_error_falling_as_the_square_of_the_step
 
 @every_law
 def test_two_fingers_agree(law: str) -> None:
-    # ngspice's first steps are of first order, and the body takes its charge within 0.1 us.
+    # The body takes its charge within 0.1 us.
     gap, worst = as_it_is("two_fingers", law, max_step=1e-7, after=2e-6)
     assert gap <= 1e-5
     assert worst <= 1.4e-4
