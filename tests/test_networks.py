@@ -404,23 +404,6 @@ def test_large_voltages_change_the_reference_areas() -> None:
     assert np.abs(s.u_gap - exact.u_gap).max() <= s.error.u_gap + exact.error.u_gap
 
 
-@pytest.mark.parametrize(
-    ("source", "law"), by_turns(["SIN(0 200 5k)", "SIN(30 120 5k)", "PULSE(120 -120 100u 0 0 100u 200u)"])
-)
-def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: str, law: str) -> None:
-    circuit = deck(f"Vdrive a 0 {source}", "Rout a b 47k", *finger("b", "0"), "Ccable b 0 150p", ".tran 1u 12.1m uic")
-    t = np.linspace(0.0, 12.1e-3, 3001)
-    for rtol in (1e-3, 1e-8):
-        run = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=rtol)
-        stepped = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=rtol, method="exponential")
-        assert run.stats["repeated"] > 20
-        assert stepped.stats["repeated"] == 0
-        assert np.abs(run.u_gap - stepped.u_gap).max() <= run.error.u_gap + stepped.error.u_gap
-        assert np.abs(run.q_source - stepped.q_source).max() <= run.error.q_source + stepped.error.q_source
-        whole = np.abs(run.i_source - stepped.i_source).max()
-        assert whole <= 300.0 * rtol * np.abs(stepped.i_source).max()
-
-
 def test_windows_of_a_long_run_join() -> None:
     circuit = floating("SIN(0 200 5k)")
     late = np.linspace(1.2, 1.2 + 2e-4, 50)
