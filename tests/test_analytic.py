@@ -64,16 +64,6 @@ def test_forty_digits_solve_equation_four():
         assert abs((a / alpha) ** (1 / m) - root - t["F_N_N"]) < mp.mpf(10) ** -38
 
 
-def test_hertz_exponents_make_equation_four_the_jkr_theory():
-    radius, e_star = 8e-3, 5e4
-    m, n, alpha, beta = ref.jkr_parameters(radius, e_star)
-    params = replace(ref.TABLE1, m=m, n=n, alpha=alpha, beta=beta)
-    for u in (0.0, 1.0, 50.0, 300.0, 2000.0):
-        w = ref.TABLE1.eps0 * ref.TABLE1.eps_a * u**2 / (2.0 * ref.TABLE1.d_a)
-        jkr = ref.jkr_area(ref.TABLE1.force_normal, w, e_star, radius)
-        assert float(ref.ridge_area_unloaded_mp(u, params)) == pytest.approx(jkr, rel=1e-14)
-
-
 def test_area_has_its_maximum_at_43_volts_and_a_kink_at_zero():
     v = np.linspace(0.0, 100.0, 10001)
     a = ref.area(v)

@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 import analytic as ref
 import fingerspice as fs
 from fingerspice.explorer.scene import as_deck, scene
-from ngspice_tools import run_ngspice
+from ngspice_tools import beside
 from scenes import deck, finger, table1, table1_deck
 
 Areas = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -79,6 +79,12 @@ def sine_slope(t: float) -> float:
 
 
 TIMES = np.linspace(0.0, 0.02, 101)
+
+
+def two_fingers(volts: float = 200.0) -> fs.Circuit:
+    """The gaps Xgap1 and Xgap2 beside one another under a sine of 100 Hz."""
+    lines = [*finger("drive", "0", "area1", "1", f=100.0), *finger("drive", "0", "area2", "2", f=100.0)]
+    return deck(f"Vdrive drive 0 SIN(0 {volts:g} 100)", *lines, ".tran 0.2m 20m uic")
 
 
 @pytest.mark.parametrize("method", ["auto", "radau"])
@@ -241,9 +247,7 @@ def test_soft_gaps_are_refused_where_they_cannot_be(changes: dict[str, Any], act
 
 def test_two_fingers_of_a_network_each_have_their_law() -> None:
     one = deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0), ".tran 0.2m 20m uic")
-    lines = [*finger("drive", "0", "area1", "1", f=100.0), *finger("drive", "0", "area2", "2", f=100.0)]
-    two = deck("Vdrive drive 0 SIN(0 200 100)", *lines, ".tran 0.2m 20m uic")
-    two = two.replace({"Xgap1.law": LAW, "Xgap1.k": 60e-6, "Xgap2.law": "dmt"})
+    two = two_fingers().replace({"Xgap1.law": LAW, "Xgap1.k": 60e-6, "Xgap2.law": "dmt"})
     both = fs.simulate(two, t_eval=TIMES, rtol=1e-7)
     for k, law in enumerate((OWN, {"Xgap.law": "DMT"})):
         other = fs.simulate(one.replace(law), t_eval=TIMES, rtol=1e-9)
@@ -279,14 +283,13 @@ def test_a_phasors_area_is_that_of_the_rms_voltage() -> None:
     assert found == pytest.approx(own_areas(200.0 * gain / np.sqrt(2.0)), rel=1e-9)
 
 
-def test_the_export_for_ngspice_has_the_areas_as_points() -> None:
-    circuit = table1(tran="2u 20m 0 2u uic").replace(OWN)
-    text = fs.export_netlist(circuit)
-    assert "GAP with the contact law pulled" in text
-    run = run_ngspice(text, ("v(top)-v(skin)", "v(area)"))
-    ours = fs.simulate(circuit, t_eval=np.clip(run["time"], 0.0, 0.02), rtol=1e-8)
-    assert np.abs(run["v(top)-v(skin)"] - ours.u_gap).max() <= 1e-4 * np.abs(ours.u_gap).max()
-    np.testing.assert_allclose(run["v(area)"], 1e6 * ours.area, rtol=2e-4)
+@pytest.mark.parametrize("changes", [OWN, {"Xgap.p_sat": 50e3}], ids=["own law", "saturating"])
+def test_the_export_for_ngspice_has_the_areas_as_points(changes: dict[str, Any]) -> None:
+    circuit = table1(tran="2u 20m 0 2u uic").replace(changes)
+    assert ("GAP with the contact law pulled" in fs.export_netlist(circuit)) == (changes is OWN)
+    ours, _, u_gap, area = beside(circuit, rtol=1e-8)
+    assert np.abs(ours.u_gap - u_gap).max() <= 1e-4 * np.abs(ours.u_gap).max()
+    np.testing.assert_allclose(1e6 * ours.area, area, rtol=2e-4)
 
 
 def two_scales(u: float, p_sat: float) -> tuple[float, float]:
@@ -398,9 +401,7 @@ def test_a_slip_is_a_first_order_low_pass_of_the_periodic_friction(speed: float)
 
 
 def test_a_slip_holds_for_networks_files_and_long_runs_and_is_refused_where_it_cannot(tmp_path: Path) -> None:
-    lines = [*finger("drive", "0", "area1", "1", f=100.0), *finger("drive", "0", "area2", "2", f=100.0)]
-    two = deck("Vdrive drive 0 SIN(0 200 100)", *lines, ".tran 0.2m 20m uic")
-    both = fs.simulate(two.replace({"Xgap1.slip": SLIP, "Xgap1.v": SPEED}), t_eval=TIMES, rtol=1e-9)
+    both = fs.simulate(two_fingers().replace({"Xgap1.slip": SLIP, "Xgap1.v": SPEED}), t_eval=TIMES, rtol=1e-9)
     alone = fs.simulate(table1(gap={"slip": SLIP, "v": SPEED}), t_eval=TIMES, rtol=1e-9)
     np.testing.assert_allclose(both.f_t[:, 0], alone.f_t, rtol=1e-7)
     np.testing.assert_allclose(both.f_t[:, 1], fs.simulate(table1(), t_eval=TIMES, rtol=1e-9).f_t, rtol=1e-7)
@@ -427,14 +428,6 @@ def test_a_slip_holds_for_networks_files_and_long_runs_and_is_refused_where_it_c
     ):
         with pytest.raises(fs.InputError, match=said):
             refused()
-
-
-def test_ngspice_agrees_with_a_saturating_contact_and_refuses_it_without_its_areas() -> None:
-    circuit = table1(gap={"p_sat": 50e3}, tran="2u 20m 0 2u uic")
-    run = run_ngspice(fs.export_netlist(circuit), ("v(top)-v(skin)", "v(area)"))
-    ours = fs.simulate(circuit, t_eval=np.clip(run["time"], 0.0, 0.02), rtol=1e-8)
-    assert np.abs(run["v(top)-v(skin)"] - ours.u_gap).max() <= 1e-4 * np.abs(ours.u_gap).max()
-    np.testing.assert_allclose(run["v(area)"], 1e6 * ours.area, rtol=2e-4)
 
 
 def test_a_file_keeps_the_law_and_the_figures(tmp_path: Path) -> None:
@@ -554,8 +547,7 @@ def test_areas_that_end_beyond_the_runs_voltages_do_not_matter() -> None:
     # The source reaches 200 V, and the gap takes less than the 215 V at which the areas of this law end.
     assert fs.simulate(table1().replace(OWN)).success
     short = {"Xgap.law": SHORT, "Vdrive": fs.Sine(60.0, 100.0)}
-    lines = [*finger("drive", "0", "area1", "1", f=100.0), *finger("drive", "0", "area2", "2", f=100.0)]
-    two = deck("Vdrive drive 0 SIN(0 60 100)", *lines, ".tran 0.2m 20m uic").replace({"Xgap1.law": SHORT})
+    two = two_fingers(60.0).replace({"Xgap1.law": SHORT})
     assert fs.simulate(table1().replace(short)).success
     assert fs.simulate(two).success
     with pytest.raises(fs.InputError, match=r"passes 49\.95 V, up to which areas of the contact law short"):

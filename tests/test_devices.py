@@ -12,7 +12,7 @@ from fingerspice.base.units import parse_number
 from fingerspice.circuit.devices import DEVICES, DeviceSpec, ParameterSpec, Usual, called_devices
 from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from fingerspice.physics.materials import EPS0
-from ngspice_tools import run_ngspice
+from ngspice_tools import beside
 
 #: Parameters of the bodies that say how a run starts, and the reading of Eq. 7: the export writes them.
 OF_THE_EXPORT = {"ic", "a_ic", "wk"}
@@ -69,18 +69,15 @@ def test_a_layer_is_the_same_here_and_in_ngspice(name: str, law: str) -> None:
         ".tran 1u 2m 0 0.5u uic\n.nodeset v(area)=34.97\n.end\n"
     )
     text = text if DEVICES[name].is_layer else text.replace(".nodeset v(area)=34.97\n", "")
-    theirs = run_ngspice(text, signals=["v(p)", "v(area)"] if DEVICES[name].is_layer else ["v(p)"])
     circuit = fs.parse_netlist(text)
     assert circuit.warnings == ()
-    t, keep = np.unique(np.minimum(theirs["time"], 2e-3), return_index=True)
-    # ngspice's first steps are of first order.
-    t, keep = t[t > 1e-5], keep[t > 1e-5]
-    ours = fs.simulate(circuit, t_eval=t)
-    peak = np.abs(ours.node_voltages["p"]).max()
+    run, nodes, _, theirs = beside(circuit, text, after=1e-5)
+    ours, there = nodes["p"]
+    peak = np.abs(ours).max()
     assert 0.5 < peak < 19.5
-    assert np.abs(ours.node_voltages["p"] - theirs["v(p)"][keep]).max() <= 1e-5 * peak
+    assert np.abs(ours - there).max() <= 1e-5 * peak
     if DEVICES[name].is_layer:
-        assert np.abs(1e6 * ours.area - theirs["v(area)"][keep]).max() <= 5e-3
+        assert np.abs(1e6 * run.area - theirs).max() <= 5e-3
 
 
 def test_a_new_device_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:

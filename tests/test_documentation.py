@@ -27,7 +27,7 @@ from fingerspice.circuit.devices import SOURCES as USUAL_OF_SOURCES
 from fingerspice.explorer.scene import EXAMPLES
 from fingerspice.netlist.reader import DIRECTIVES, ELSEWHERE
 from fingerspice.netlist.sources import SOURCES
-from ngspice_tools import CIRCUITS, run_ngspice
+from ngspice_tools import CIRCUITS, beside
 from scenes import cases
 
 ROOT = Path(__file__).parents[1]
@@ -310,14 +310,10 @@ def test_a_deck_of_ltspice_runs_with_its_parasitics() -> None:
 
 @pytest.mark.parametrize("text", [FINGER, FILM, AMPLIFIER, TWO_FINGERS, CREEP], ids=lambda text: text[:9])
 def test_the_other_decks_run_unchanged_in_ngspice(text: str) -> None:
-    ours = run(text)
-    nodes = [node for node in ours.node_voltages if "." not in node]
-    areas = {e.node_names[2] for e in ours.circuit.elements if e.spec.is_layer and "." not in e.node_names[2]}
-    theirs = run_ngspice(text, signals=[f"v({node})" for node in [*nodes, *areas]])
-    for node in nodes:
-        peak = np.abs(ours.node_voltages[node]).max()
-        assert theirs[f"v({node})"][-1] == pytest.approx(ours.node_voltages[node][-1], abs=2e-3 * peak)
-    assert {round(theirs[f"v({node})"][-1], 1) for node in areas} == set(np.round(1e6 * np.ravel(ours.area[-1]), 1))
+    run, nodes, _, area = beside(fs.parse_netlist(text), text)
+    for ours, theirs in nodes.values():
+        assert theirs[-1] == pytest.approx(ours[-1], abs=2e-3 * np.abs(ours).max())
+    np.testing.assert_allclose(area[-1], 1e6 * run.area[-1], rtol=0, atol=0.05)
 
 
 def test_the_table_of_parameters_is_that_of_the_devices() -> None:

@@ -16,7 +16,7 @@ from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import Tran
 from fingerspice.netlist.lexer import decimal_comma
 from fingerspice.netlist.reader import ELSEWHERE, LIBRARIES, shipped_text
-from ngspice_tools import call_ngspice, run_ngspice, with_max_step
+from ngspice_tools import beside, call_ngspice, with_max_step
 from scenes import DECKS, listed
 
 TRAN = ".tran 10u 50m uic"
@@ -53,14 +53,9 @@ def test_what_ltspice_saves_loads_and_is_the_same_circuit_as_ours() -> None:
 def test_a_source_with_rser_is_exported_with_it_and_runs_in_ngspice() -> None:
     circuit, said = read(("SIN(0 200 100)", "SIN(0 200 100) Rser=1meg Cpar=10p"), (TRAN, ".tran 10u 20m 0 2u uic"))
     assert said == []
-    text = fs.export_netlist(circuit)
-    assert "RVdrive_Rser drive Vdrive_Rser 1000000.0" in text
-    theirs = run_ngspice(text, signals=["v(top)-v(skin)"])
-    t, keep = np.unique(np.minimum(theirs["time"], 0.02), return_index=True)
-    t, keep = t[t > 1e-4], keep[t > 1e-4]
-    ours = fs.simulate(circuit, t_eval=t).u_gap
-    assert ours is not None
-    assert np.abs(ours - theirs["v(top)-v(skin)"][keep]).max() <= 1e-4 * np.abs(ours).max()
+    assert "RVdrive_Rser drive Vdrive_Rser 1000000.0" in fs.export_netlist(circuit)
+    run, _, theirs, _ = beside(circuit, after=1e-4)
+    assert np.abs(run.u_gap - theirs).max() <= 1e-4 * np.abs(run.u_gap).max()
 
 
 def test_an_rser_is_the_resistor_that_it_stands_for_by_hand() -> None:
@@ -130,10 +125,8 @@ def test_named_values_and_parts_are_those_of_ngspice() -> None:
         "t\nV1 a 0 SIN(0 10 1k)\nR1 a b r=10k // behind a divider\nR2 b 0 10k m=2 ; two\nC1 b 0 c=2n m=5 $ five\n"
         ".tran 1u 2m 0 0.5u uic\n.end\n"
     )
-    theirs = run_ngspice(text, signals=["v(b)"])
-    t, keep = np.unique(np.minimum(theirs["time"], 2e-3), return_index=True)
-    ours = fs.simulate(fs.parse_netlist(text), t_eval=t).node_voltages["b"]
-    assert np.abs(ours - theirs["v(b)"][keep]).max() <= 1e-5 * np.abs(ours).max()
+    ours, theirs = beside(fs.parse_netlist(text), text).nodes["b"]
+    assert np.abs(ours - theirs).max() <= 1e-5 * np.abs(ours).max()
 
 
 def test_a_gap_has_the_librarys_defaults_which_are_table_1() -> None:

@@ -39,7 +39,7 @@ class Scene:
 
 
 def smooth(stop: float, u: Callable[[np.ndarray], np.ndarray]) -> list[ref.Segment]:
-    return [(0.0, stop, u, u)]
+    return [(0.0, stop, u)]
 
 
 def triangle(amplitude: float, f: float) -> list[ref.Segment]:

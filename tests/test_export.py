@@ -1,4 +1,4 @@
-"""Exported decks, shipped ones and fifty random ones: ngspice 39 runs them alone, with the voltages found here."""
+"""Shipped decks as they are, and exported ones with fifty random ones, in ngspice 39: the voltages found here."""
 
 import dataclasses
 import re
@@ -9,11 +9,11 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.netlist.reader import LIBRARIES, shipped_text
-from ngspice_tools import CIRCUITS, call_ngspice, run_ngspice
+from ngspice_tools import CIRCUITS, beside, call_ngspice, run_ngspice, with_charge_law
 from random_decks import NETWORKS, SOURCES
 from random_decks import deck as random_deck
 from scenes import DECKS as OTHERS
-from scenes import LAWS, cases, deck, shipped, table1
+from scenes import LAWS, cases, deck, every_law, shipped, table1
 
 NESTED = OTHERS / "nested.cir"
 SEEDS = range(cases(50, 20))
@@ -23,39 +23,86 @@ BEGINNINGS = {"burst": 2.1e-3, "chirp": 3e-3, **({"texture_recording": 0.05} if 
 JUMPS = ("jump", "pwl", "repeat", "square", "pulse")
 
 
-def deviation(circuit: fs.Circuit, law: str | None = None) -> tuple[float, float]:
-    """Largest differences from ngspice at its own times, beside the edges, which take up to 1 ns there.
+def deviation(
+    circuit: fs.Circuit, law: str | None = None, text: str = "", max_step: float | None = None, after: float = 0.0
+) -> tuple[float, float]:
+    """Largest differences from ngspice, which runs `text`, or the exported deck.
 
-    That of the gap voltage (of node voltages without a GAP) over its peak; and that of a node's voltage over the
+    That of a gap voltage (of node voltages without a GAP) over its peak; and that of a node's voltage over the
     largest of all, or of an area over 35 mm^2.
     """
-    layers = [e for e in circuit.elements if e.spec.is_layer]
-    areas = {e.node_names[2]: e for e in layers}
-    named = {name: node for e in circuit.elements for node, name in zip(e.nodes[:2], e.node_names[:2], strict=True)}
-    nodes = [name for name, node in named.items() if node != "0" and name not in areas]
-    shown = {name: f"v({name.replace('.', '_')})" for name in (*nodes, *areas)}
-    text = fs.export_netlist(circuit, charge_law=law)
-    theirs = run_ngspice(text, signals=list(shown.values()), timeout=60.0)
-    t, first = np.unique(np.minimum(theirs["time"], circuit.tran.stop), return_index=True)
-    waves = [e.waveform for e in circuit.by_device("V", "I") if e.waveform is not None]
-    edges = np.concatenate([np.zeros(1), *(wave.breakpoints(0.0, t[-1]) for wave in waves)])
-    away = np.abs(t[:, None] - edges[None, :]).min(axis=1) > 3e-9
-    assert away.sum() > 900
     # Lanes, which recordings would take, are compiled for every number of modes.
     method = "exponential" if circuit.by_device("GAP") else "auto"
-    ours = fs.simulate(circuit, charge_law=law, t_eval=t[away], rtol=1e-9, method=method)
-    voltages = {name.lower(): v for name, v in ours.node_voltages.items()}
-    there = {name: theirs[signal][first][away] for name, signal in shown.items()} | {"0": 0.0}
-    peak = max(np.abs(v).max() for v in voltages.values())
-    worst = max(float(np.abs(voltages[name.lower()] - there[name]).max() / peak) for name in nodes)
-    if ours.u_gap is None:
+    run, nodes, u_gap, area = beside(circuit, text, law, max_step=max_step, after=after, rtol=1e-9, method=method)
+    assert run.t.size > 500
+    peak = max(np.abs(ours).max() for ours, _ in nodes.values())
+    worst = max(float(np.abs(ours - theirs).max() / peak) for ours, theirs in nodes.values())
+    if u_gap is None:
         return worst, worst
-    gaps = circuit.by_device("GAP")
-    for gap, area in zip(gaps, np.atleast_2d(np.transpose(ours.area)), strict=False):
-        worst = max(worst, float(np.abs(1e6 * area - there[gap.node_names[2]]).max() / 35.0))
-    p, n = ("0" if node == "0" else name for node, name in zip(gaps[0].nodes[:2], gaps[0].node_names[:2], strict=True))
-    own = ours.u_gap.reshape(t[away].size, -1)[:, 0]
-    return float(np.abs(own - (there[p] - there[n])).max() / np.abs(own).max()), worst
+    off = np.abs(run.u_gap - u_gap).max(axis=0) / np.abs(run.u_gap).max(axis=0)
+    return float(np.max(off)), max(worst, float(np.abs(1e6 * run.area - area).max() / 35.0))
+
+
+STACKS = ["fingerpad", "fingerpad_5khz", "fingerpad_square", "fingerpad_square_5khz", "fingerpad_dispersive"]
+ONE_GAP = ["ungrounded_user", "amplifier", "screen_protector", "current_drive", "am_carrier", "click", "learned_drive"]
+
+
+def as_it_is(name: str, law: str, *changes: tuple[str, str], **how: float) -> tuple[float, float]:
+    """`deviation` of a shipped deck, not exported, under a charge law and with changes of its text."""
+    text = with_charge_law((CIRCUITS / f"{name}.cir").read_text(), law)
+    for change in changes:
+        text = text.replace(*change)
+    circuit = fs.parse_netlist(text)
+    assert circuit.charge_law == law
+    return deviation(circuit, text=text, **how)
+
+
+@every_law
+@pytest.mark.parametrize("name", STACKS)
+def test_sines_agree_to_1e_5_of_peak_and_squares_within_what_the_step_allows(name: str, law: str) -> None:
+    # netlist.md: T/1000 gives 1e-6 on sines to 1e-4 on squares.
+    assert as_it_is(name, law)[0] <= (1e-4 if "square" in name else 1e-5)
+
+
+@every_law
+def test_agreement_improves_as_the_square_of_the_step(law: str) -> None:
+    coarse, _ = as_it_is("fingerpad", law, max_step=1e-4)
+    fine, worst = as_it_is("fingerpad", law, max_step=1e-6)
+    assert coarse > 1e-5
+    assert fine <= 1e-7
+    assert worst <= 5e-5
+
+
+# The charge laws in turn, and under stress both for each circuit.
+IN_TURN = [(name, law) for i, name in enumerate(ONE_GAP) for law in LAWS[:: (-1) ** i][: cases(2, 1)]]
+
+
+@pytest.mark.parametrize(("name", "law"), IN_TURN)
+def test_other_circuits_agree_with_their_error_falling_as_the_square_of_the_step(name: str, law: str) -> None:
+    coarse, _ = as_it_is(name, law, after=2e-6)
+    fine, worst = as_it_is(name, law, max_step=shipped(name).tran.step / 4.0, after=2e-6)
+    assert coarse <= 1e-4
+    assert fine <= max(coarse / 10.0, 5e-6)
+    assert worst <= 1e-3
+
+
+@every_law
+def test_two_fingers_agree(law: str) -> None:
+    # The body takes its charge within 0.1 us.
+    gap, worst = as_it_is("two_fingers", law, max_step=1e-7, after=2e-6)
+    assert gap <= 1e-5
+    assert worst <= 1.4e-4
+
+
+@every_law
+def test_contact_kinetics_agree(law: str) -> None:
+    gap, worst = as_it_is("fingerpad", law, ("c2=5000", "c2=5000 tau=2m"), (".nodeset", ".ic"))
+    assert gap <= 1e-5
+    assert worst <= 1.4e-4
+
+
+def test_every_shipped_deck_is_read_without_a_warning() -> None:
+    assert [path.stem for path in DECKS if fs.read_netlist(path).warnings] == []
 
 
 @pytest.mark.filterwarnings("ignore:Vdrive. the recording ends")

@@ -182,7 +182,3 @@ def test_random_scenes_obey_the_contact_s_law_and_amontons(amplitude, frequency,
     assert_allclose(s.f_t, 0.3 * (load + s.sigma_el * s.area), rtol=1e-12)
     own = dataclasses.replace(ref.TABLE1, d_a=d_gap, force_normal=load)
     assert_allclose(s.area, ref.area(s.u_gap, own), rtol=1e-11)
-
-
-def _parameters(d_gap, load):
-    return dataclasses.replace(ref.TABLE1, d_a=d_gap, force_normal=load)

@@ -8,7 +8,7 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 from fingerspice.solve import stepping
-from scenes import by_turns, dispersive_deck, every_law, table1, table1_deck
+from scenes import by_turns, deck, dispersive_deck, every_law, finger, table1, table1_deck
 
 # A square's edges reach beyond the band of the dispersive skin's data.
 pytestmark = pytest.mark.filterwarnings("ignore:of the source's energy")
@@ -48,6 +48,18 @@ def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: fs.Wa
     assert stepped.stats["repeated"] == 0
     assert run.stats["steps"] < 0.7 * stepped.stats["steps"]
     alike(run, stepped, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("source", "law"), by_turns(["SIN(0 200 5k)", "SIN(30 120 5k)", "PULSE(120 -120 100u 0 0 100u 200u)"])
+)
+@pytest.mark.parametrize("rtol", [1e-3, 1e-8])
+def test_a_repeated_period_of_a_network_is_the_one_that_would_have_been_stepped(source, law, rtol) -> None:
+    circuit = deck(f"Vdrive a 0 {source}", "Rout a b 47k", *finger("b", "0"), "Ccable b 0 150p", ".tran 1u 12.1m uic")
+    run, stepped = both(circuit, 12.1e-3, law, rtol)
+    assert run.stats["repeated"] > 20
+    assert stepped.stats["repeated"] == 0
+    alike(run, stepped, 300.0)
 
 
 @every_law
