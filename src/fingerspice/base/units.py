@@ -131,3 +131,9 @@ def _why_not_a_number(text: str) -> str:
             plain = f"{parse_number(guess) / 100.0:g}" if text.endswith("%") else guess
             return f"'{text}' is not a number{why}: write {plain}"
     return f"'{text}' is not a number (examples: 10, 2.5, 1e-6, 3.5u, 0.2meg)"
+
+
+def amount_text(value: float, unit: str) -> str:
+    """A value with its unit: an area takes no prefix, which would be squared with its unit, and a coefficient none."""
+    plain = {"m^2": f"{1e6 * value:.4g} mm^2", "1": f"{value:.4g}"}
+    return plain.get(unit) or format_si(value, unit)

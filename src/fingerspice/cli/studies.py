@@ -17,9 +17,9 @@ from fingerspice.base.announcing import paced
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside, write_csv
 from fingerspice.base.pages import Table
+from fingerspice.base.units import amount_text
 from fingerspice.cli.options import Job, Makes, number
 from fingerspice.cli.terminal import complain
-from fingerspice.results.record import amount_text
 from fingerspice.waveforms.waveform import refuse, require
 
 #: Keys of a sweep's file, and the arguments of `batch` among them.

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import BoolArray, FloatArray, read_only
 from fingerspice.base.errors import InputError
-from fingerspice.base.units import format_si
 from fingerspice.circuit.network import Network
 from fingerspice.engine.network import Net
 from fingerspice.physics.contact import Contact, areas, forces, inverse_area_array
@@ -59,12 +58,6 @@ SIGNALS = {
 def signal_of(name: str) -> Signal:
     """What is fixed about a signal that is given as ``key`` or ``key:element``."""
     return SIGNALS[name.partition(":")[0]]
-
-
-def amount_text(value: float, unit: str) -> str:
-    """A value with its unit: an area takes no prefix, which would be squared with its unit, and a coefficient none."""
-    plain = {"m^2": f"{1e6 * value:.4g} mm^2", "1": f"{value:.4g}"}
-    return plain.get(unit) or format_si(value, unit)
 
 
 class Sealed:

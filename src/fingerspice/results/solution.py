@@ -15,7 +15,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, Remembering, read_only
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown, Table
-from fingerspice.base.units import format_si
+from fingerspice.base.units import amount_text, format_si
 from fingerspice.circuit.describe import head_lines
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.measures import Measuring, saved_columns
@@ -24,7 +24,6 @@ from fingerspice.results.record import (
     Sealed,
     Signalled,
     Signals,
-    amount_text,
     attribute,
     kept_rows,
     signal_of,
