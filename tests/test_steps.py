@@ -206,8 +206,9 @@ def test_run_writes_steps_and_analyses(command: Command) -> None:
     assert [one["status"] for one in answer["steps"]] == ["one_by_one", "refused", "one_by_one"]
     assert answer["steps"][2]["figures"]["most"] > 0.1
     assert "gap = -1e-06" in done.err
-    assert len(answer["dc"]) == 5
-    assert answer["op"]["u_gap"] == 0.0
+    assert len(answer["dc"]) == 15
+    assert answer["op"] is None
+    assert ".ac beside .step is done with the deck's own values" in done.err
     assert len(answer["sweeps"][0]["frequency"]) == 16
     names = sorted(path.name for path in Path("out").iterdir() if path.name[0] != ".")
     assert names == ["steps.nc", "steps.png", "steps_ac.csv", "steps_ac.png", "steps_dc.csv", "steps_dc.png"]

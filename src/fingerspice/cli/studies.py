@@ -83,7 +83,8 @@ def _first_rows(columns: Mapping[str, Any]) -> str:
 
 def ends_beside(circuit: fs.Circuit) -> list[str]:
     """Endings of the files of what a deck asks for beside its run."""
-    return [f"_{kind}.{end}" for kind, on in (("dc", circuit.dc), ("ac", circuit.ac)) if on for end in ("csv", "png")]
+    kinds = {"dc": circuit.dc or (circuit.op and circuit.steps), "ac": circuit.ac}
+    return [f"_{kind}.{end}" for kind, on in kinds.items() if on for end in ("csv", "png")]
 
 
 def without_run(job: Job, circuit: fs.Circuit, ends: Iterable[str]) -> None:
@@ -100,13 +101,13 @@ def beside_run(job: Job, circuit: fs.Circuit) -> tuple[list[str], Makes]:
     from fingerspice.studies.steps import table_of
 
     texts, makes = list[str](), dict[str, Any]()
-    if circuit.op:
+    if circuit.op and not circuit.steps:
         found = fs.operating_points(dataclasses.replace(circuit, dc=()), charge_law=job.charge_law)
         point = {str(name): float(one) for name, one in found.data_vars.items() if name != "status"}
         job.answer.update(op=point)
         cells = [(name, amount_text(x, found[name].attrs["units"])) for name, x in point.items()]
         texts.append(Table(("operating point", ""), cells).text())
-    if circuit.dc:
+    if circuit.dc or (circuit.op and circuit.steps):
         from fingerspice.plots.picture import plot_steps
 
         swept = fs.operating_points(circuit, charge_law=job.charge_law)
@@ -117,6 +118,8 @@ def beside_run(job: Job, circuit: fs.Circuit) -> tuple[list[str], Makes]:
     if circuit.ac is not None:
         from fingerspice.plots.traces import plot_phasor
 
+        if circuit.steps:
+            complain("note: .ac beside .step is done with the deck's own values")
         sweeps = (fs.phasor(circuit, sweep_frequencies(circuit.ac)),)
         job.answer.update(sweeps=[one.to_dict() for one in sweeps] if job.json else None)
         makes |= {"_ac.csv": partial(phasor_csv, sweeps), "_ac.png": partial(plot_phasor, sweeps, circuit)}

@@ -209,9 +209,9 @@ def read_measure(
         For an unknown form, a vector that the circuit does not have, and a name that was given before.
     """
     words = _Line(line, start, params, elements)
-    analysis = words.take("the analysis, such as TRAN")[1].lower()
+    # LTspice's lines may lack the analysis.
+    analysis = words.word("tran", "ac", *_OTHERS) or "tran"
     name = words.take("the measure's name")[1]
-    refuse(analysis not in ("tran", "ac", *_OTHERS), f".meas {analysis!r}; allowed: TRAN or AC", line.where(start))
     words.ac = analysis == "ac"
     refuse(any(one.name.lower() == name.lower() for one in before), f".meas {name} is given twice", line.where(start))
     if analysis in _OTHERS:
@@ -225,7 +225,7 @@ def read_measure(
         words.equals()
         place = words.where
         text = line.text[words.words[words.at][2] :] if words.at < len(words.words) else ""
-        text, words.at = text.strip().strip("'{}").strip(), len(words.words)
+        text, words.at = text.strip().strip("\"'{}").strip(), len(words.words)
         refuse(not text, f".meas {name} PARAM has no expression", place)
         known = {one.name.lower() for one in before}
         needs = tuple(known.intersection(words.check(text, {*known, *params}, place)))

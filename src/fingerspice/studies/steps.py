@@ -117,7 +117,7 @@ def run_steps(
 
 
 def operating_points(circuit: Circuit, *, charge_law: str | None = None) -> Dataset:
-    """The operating point of a circuit with its areas, at all values of its deck's `.dc` line where there is one.
+    """The operating point of a circuit with its areas, at all values of its deck's `.dc` and `.step` lines.
 
     Sources are at their values before 0 s, and all that could change has settled.
 
@@ -149,7 +149,7 @@ def operating_points(circuit: Circuit, *, charge_law: str | None = None) -> Data
         run = simulate(held, t_stop=_MOMENT, t_eval=[0.0], start="dc", charge_law=charge_law)
         return {name: ((), x[0], {"units": unit}) for name, (x, unit, _) in run.signals.items()}
 
-    return _found(circuit, circuit.dc, point, None)
+    return _found(circuit, (*circuit.dc, *circuit.steps), point, None)
 
 
 def table_of(found: Dataset) -> tuple[list[dict[str, Any]], dict[str, list[Any]]]:
