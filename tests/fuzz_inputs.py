@@ -57,6 +57,8 @@ LINES = (
     *(".tran {n} {n} {n} uic", ".ac dec {n} {n} {n}", ".ic v({w})={n}", ".options {w}={n}",
       ".options work=total", ".nodeset {w}"),
     *(".step {w}", ".{w}", "+ {w}={n}", "+", "* {w}", "{w}", "D1 a b d", "L1 a 0 {n}", ".title {w}",
+      "L2 a b {n} ic={n}", "K1 L1 L2 {n}", "E1 {w} 0 a b {n}", "G1 a b {w} 0 {n}", "F1 a 0 {w} {n}",
+      "H1 {w} b V1 {n}", "S1 a b {w} 0 {w}", ".model {w} SW(Ron={n} vt={n})",
       ".meas {w}", ".func f(x) x"),
     *(".tran {n}", ".tran 0 {n} 0 {n}", ".backanno", "R{w} {w} {w} r={n} m={n} tol={n}", "V{w} {w} 0 {s} Rser={n}",
       "C{w} {w} {w} c={n} Rser={n} Rpar={n} Cpar={n} Lser={n}", "R1 a b {n},{n} // {w}",

@@ -180,7 +180,8 @@ def test_a_source_that_follows_another_keeps_the_exponential_steps(law: str) -> 
 
 
 def test_elements_of_subcircuits_control_those_beside_them() -> None:
-    body = "Vs p q 0\nF1 0 out Vs {gain}\nRs q 0 1k\nL1 q x 1m\nL2 out y 1m\nK1 L1 L2 0.5\nRx x 0 50\nRy y 0 50"
+    coils = "L1 q x 1m\nL2 out y 1m\nK1 L1 L2 0.5\nRx x 0 50\nRy y 0 50\nRo out 0 1k"
+    body = f"Vs p q 0\nF1 0 out Vs {{gain}}\nRs q 0 1k\n{coils}"
     calls = "X1 in a mirror gain=2\nX2 in b mirror\n.tran 5u 1m uic"
     circuit = parse(f"V1 in 0 SIN(0 1 1k)\n.subckt mirror p out gain=1\n{body}\n.ends\n{calls}")
     assert circuit["X1.F1"].control == ("x1.vs",)
