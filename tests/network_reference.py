@@ -56,8 +56,8 @@ class Nodal:
     nodes: int
     resistors: Sequence[Branch]
     capacitors: Sequence[Capacitor]
-    voltages: Sequence[tuple[int, int, Tone]]
-    currents: Sequence[tuple[int, int, Tone]]
+    voltages: list[tuple[int, int, Tone]]
+    currents: list[tuple[int, int, Tone]]
     initial: dict[int, float] = field(default_factory=dict)
     uic: bool = True
 
@@ -161,8 +161,8 @@ def _in_turn(levels: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
     return x
 
 
-def random_network(seed: int) -> Nodal:
-    """A network of 2 to 6 nodes with random ``IC=`` and ``.ic``, with ``uic`` or not; the sources constant."""
+def random_network(seed: int, swinging: bool = False) -> Nodal:
+    """A network of 2 to 6 nodes with random ``IC=`` and ``.ic``, with ``uic`` or not; the sources constant or tones."""
     rng = np.random.default_rng(seed)
     while True:
         found = _draw(rng)
@@ -170,6 +170,10 @@ def random_network(seed: int) -> Nodal:
             found.start()
         except ValueError:
             continue
+        for sources in (found.voltages, found.currents) if swinging else ():
+            for i, (p, n, tone) in enumerate(sources):
+                amplitude, frequency = rng.uniform(-2.0, 2.0) * tone.offset, rng.choice([1e3, 7e4])
+                sources[i] = (p, n, Tone(tone.offset, float(amplitude), float(frequency)))
         return found
 
 

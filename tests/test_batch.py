@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import butter, sosfilt
 
 import analytic as ref
 import fingerspice as fs
+import recording_errors
 from batches import alike, check, population, singles, singly
 from fingerspice.circuit.circuit import Circuit
 from scenes import DECKS, cases, dispersive_deck, listed, shipped, table1, table1_deck
@@ -326,10 +326,9 @@ RECORDED = ("f_el_mean", "f_t_rms", "u_gap_rms")
 
 
 def noise(highest: float, peak: float = 150.0, seed: int = 1) -> np.ndarray:
-    band = butter(4, [50.0, highest], "band", fs=RATE, output="sos")
-    x = sosfilt(band, np.random.default_rng(seed).standard_normal(COUNT))
-    x[0] = 0.0
-    return peak * x / np.abs(x).max()
+    values = peak * recording_errors.noise(seed, COUNT, RATE, 50.0, highest)
+    values[0] = 0.0
+    return values
 
 
 def recorded(highest: float = 1000.0, circuit: fs.Circuit | None = None, **how: Any) -> fs.Circuit:
@@ -337,14 +336,8 @@ def recorded(highest: float = 1000.0, circuit: fs.Circuit | None = None, **how: 
 
 
 def people(n: int, seed: int = 2) -> dict[str, np.ndarray]:
-    """Fingers whose resistances vary over two decades."""
-    r = np.random.default_rng(seed)
-    return {
-        "Xgap.d": r.uniform(2e-6, 6e-6, n),
-        "Xgap.r": 1e6 * 10.0 ** r.uniform(-1.0, 1.0, n),
-        "Xcoat.r": 2e5 * 10.0 ** r.uniform(-1.0, 1.0, n),
-        "Xgap.fn": r.uniform(0.2, 2.0, n),
-    }
+    """A population's fingers alone."""
+    return {path: values for path, values in population(n, seed).items() if not path.startswith("Vdrive")}
 
 
 def check_all(

@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 
 import analytic as ref
 import fingerspice as fs
+import recording_errors
 from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.base.units import parse_number, spice_text
@@ -86,9 +87,7 @@ def test_a_skin_at_another_frequency_than_the_sources_is_warned_about() -> None:
 
 def noise(low: float, high: float, rate: float = 32000.0, seconds: float = 0.2) -> fs.Samples:
     """White noise between two frequencies (Hz), 60 V rms."""
-    lines = np.fft.rfft(np.random.default_rng(1).standard_normal(round(rate * seconds)))
-    f = np.fft.rfftfreq(round(rate * seconds), 1.0 / rate)
-    values = np.fft.irfft(np.where((f > low) & (f < high), lines, 0.0))
+    values = recording_errors.noise(1, round(rate * seconds), rate, low, high)
     return fs.Samples(60.0 * values / values.std(), rate)
 
 

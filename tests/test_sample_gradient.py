@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import butter, sosfilt
 
 import fingerspice as fs
+import recording_errors
 from fingerspice.base.errors import InputError
 from scenes import cases, dispersive_deck, every_law, floating, table1, table1_deck
 
@@ -17,9 +17,7 @@ TIMES = np.linspace(0.0, T_STOP, 211)
 
 
 def noise(seed: int, peak: float = 120.0, count: int = COUNT) -> np.ndarray:
-    band = butter(4, [50.0, 1000.0], "band", fs=RATE, output="sos")
-    x = sosfilt(band, np.random.default_rng(seed).standard_normal(count))
-    return peak * x / np.abs(x).max()
+    return peak * recording_errors.noise(seed, count, RATE, 50.0, 1000.0)
 
 
 def number(run: fs.Solution, of: dict[str, Any]) -> float:
