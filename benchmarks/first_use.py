@@ -1,7 +1,7 @@
 """First and later results of a fresh installation: seconds, and how many functions are compiled.
 
-Run: python benchmarks/first_use.py out/dist/fingerspice-*.whl. It installs the wheel into an environment of its own, and
-prints for each the first process and the best of five more.
+Run: python benchmarks/first_use.py out/dist/fingerspice-*.whl. It installs the wheel into an environment of its own
+and prints for each the first process and the best of five more.
 """
 
 from __future__ import annotations
@@ -40,15 +40,17 @@ ANNOUNCED = "fingerspice: note: compiling"
 
 
 def main() -> None:
-    """Time everything in an environment of its own."""
+    """Time everything in an environment of its own, or in the one named."""
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("wheel", type=Path)
-    wheel = arguments.parse_args().wheel.resolve()
-    print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB")
+    arguments.add_argument("--python", help="of an environment where it is installed already")
+    given = arguments.parse_args()
+    print(f"{given.wheel.name}: {given.wheel.stat().st_size / 1e6:.1f} MB")
     with tempfile.TemporaryDirectory() as folder:
-        venv.create(folder, with_pip=True)
-        python = str(Path(folder, "Scripts" if sys.platform == "win32" else "bin", "python"))
-        subprocess.run([python, "-m", "pip", "install", "--quiet", str(wheel)], check=True)
+        python = given.python or str(Path(folder, "Scripts" if sys.platform == "win32" else "bin", "python"))
+        if given.python is None:
+            venv.create(folder, with_pip=True)
+            subprocess.run([python, "-m", "pip", "install", "--quiet", str(given.wheel)], check=True)
         kept = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA", "PYTHON", "HOME", "XDG"))}
         kept["MPLCONFIGDIR"] = folder
         for name, command in TIMED.items():

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -380,6 +381,29 @@ def test_what_is_built_on_private_classes_of_numba_does_what_it_is_for(tmp_path:
     command = [sys.executable, "-c", code]
     found = [subprocess.check_output(command, text=True, env=environment) for _ in range(2)]
     assert found == ["0\n", "1\n"]
+
+
+#: Every private part of numba that `base.compiled` overrides, calls or reads, by its module.
+PARTS = {
+    "numba.core.caching": "CompileResultCacheImpl NullCache "
+    "IndexDataCacheFile._load_data IndexDataCacheFile._save_data",
+    "numba.core.codegen": "JITCodeLibrary._finalize_final_module JITCodeLibrary._optimize_final_module "
+    "JITCodeLibrary._finalize_dynamic_globals JITCPUCodegen.magic_tuple",
+    "numba.core.compiler": "CompileResult._reduce CompileResult._rebuild Flags compile_extra",
+    "numba.core.dispatcher": "Dispatcher.compile Dispatcher.get_call_template Dispatcher.get_overload",
+    "numba.core.runtime.nrt": "rtsys.initialize",
+    "numba.core.types.functions": "BaseFunction.get_call_type",
+    "numba.core.typing.templates": "AttributeTemplate make_concrete_template",
+    "numba.core.targetconfig": "ConfigStack.top_or_none",
+}
+
+
+@pytest.mark.parametrize(("module", "names"), PARTS.items())
+def test_the_private_parts_of_numba_that_are_overridden_exist(module: str, names: str) -> None:
+    for name in names.split():
+        attrgetter(name)(importlib.import_module(module))
+    assert '"numba>=0.68,<0.69"' in (CIRCUITS.parent / "pyproject.toml").read_text()
+    assert numba.__version__.startswith("0.68.")
 
 
 class Outer(NamedTuple):

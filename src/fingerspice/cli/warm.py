@@ -55,9 +55,10 @@ def _run(circuit: fs.Circuit, **how: Any) -> None:
 
 
 def _recorded(circuit: fs.Circuit) -> None:
-    for part in fs.stream(circuit, t_stop=_T, chunk=_T / 2.0):
+    # Fewer samples would not go in lanes.
+    for part in fs.stream(circuit, t_stop=10.0 * _T, chunk=5.0 * _T):
         str(part)
-    fs.simulate(circuit, t_stop=_T).sample_gradient(f_el_mean=1.0)
+    fs.simulate(circuit, t_stop=10.0 * _T).sample_gradient(f_el_mean=1.0)
 
 
 def _work(name: str) -> None:
