@@ -156,8 +156,8 @@ class _Instance:
         # Nodes, or elements of the same subcircuit.
         own = (f"{self.prefix}{x.text}".lower() for x in rest)
         control = tuple(x for x, _ in self.nodes(rest)) if "node" in spec.control else tuple(own)
-        # A word of a source is a keyword (DC, SIN), that of any other element names a parameter.
-        bare: Bare = "nothing" if letter in "VIS" else "name"
+        # A word of a switch names a model; that of any other element may name a parameter, as in ngspice.
+        bare: Bare = "nothing" if letter == "S" else "name"
         body, params = scope.words(words.words[count:], bare), scope.pairs(words, bare)
         self.deck.statements.append(Statement(name, letter, canonical, written, body, params, where, control))
 

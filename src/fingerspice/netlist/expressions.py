@@ -520,8 +520,8 @@ class Scope:
             if isinstance(word, Lexeme):
                 out.append(self.value(word, bare))
             elif word.name is not None:
-                args = tuple(self.value(arg) for arg in word.words if isinstance(arg, Lexeme))
-                out.append(Call(word.name.text, args, self.pairs(word), word.name.where))
+                args = tuple(self.value(arg, bare) for arg in word.words if isinstance(arg, Lexeme))
+                out.append(Call(word.name.text, args, self.pairs(word, bare), word.name.where))
         return tuple(out)
 
 

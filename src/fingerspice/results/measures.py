@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import PhasorSolution
 
-_MOST_PIECES = 60  # Of a sweep, with as many polynomials
+_MOST_PIECES, _MOST_HALVINGS = 60, 12  # Of a sweep, with as many polynomials, before pieces are halved
 _TOLERANCE = 1e-12  # Of the polynomials in which crossings are looked for, relative to the peak
 
 
@@ -203,15 +203,30 @@ class _Swept(_Course):
 
     def __init__(self, sweep: Sweep, quantity: Quantity, since: float, until: float) -> None:
         inside = sweep.frequency[(sweep.frequency > since) & (sweep.frequency < until)]
-        inside = inside[:: 1 + inside.size // _MOST_PIECES]
-        edges = np.r_[since, inside, until]
-        self.since, self.until, self.begin, self.length = since, until, edges[:-1], np.diff(edges)
-        nodes = self.begin[:, None] + self.length[:, None] * POINTS[:NODES]
-        found = sweep.solve(nodes.ravel())
-        columns = [_part(found, vector) for vector in quantity.vectors]
-        made = columns[0] if quantity.function is None else np.vectorize(quantity.function, otypes=[float])(*columns)
-        self.t, self.x = nodes.ravel(), made
-        self.series = made.reshape(nodes.shape) @ TO_SERIES[:, :NODES]
+        edges = np.r_[since, inside[:: 1 + inside.size // _MOST_PIECES], until]
+        begin, length, found = edges[:-1], np.diff(edges), list[tuple[FloatArray, ...]]()
+        for rest in range(_MOST_HALVINGS, -1, -1):
+            nodes = begin[:, None] + length[:, None] * POINTS[:NODES]
+            solved = sweep.solve(nodes.ravel())
+            columns = [_part(solved, vector) for vector in quantity.vectors]
+            made = (
+                columns[0] if quantity.function is None else np.vectorize(quantity.function, otypes=[float])(*columns)
+            )
+            x = made.reshape(nodes.shape)
+            series = x @ TO_SERIES[:, :NODES]
+            # Near a resonance, pieces are halved until the last terms of their polynomials vanish.
+            wild = (np.abs(series[:, -2:]).max(axis=1) > _TOLERANCE * np.abs(series).max()) & (rest > 0)
+            found.append((begin[~wild], length[~wild], nodes[~wild], x[~wild], series[~wild]))
+            half = 0.5 * length[wild]
+            begin, length = np.r_[begin[wild], begin[wild] + half], np.r_[half, half]
+            if not begin.size:
+                break
+        self.since, self.until = since, until
+        order = np.concatenate([one[0] for one in found]).argsort()
+        self.begin, self.length, nodes, x, self.series = (
+            np.concatenate(one)[order] for one in zip(*found, strict=True)
+        )
+        self.t, self.x = nodes.ravel(), x.ravel()
 
     def extreme(self, sign: float) -> tuple[float, float]:
         best = int((sign * self.x).argmax()) // NODES
