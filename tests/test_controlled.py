@@ -251,6 +251,34 @@ def test_recordings_drive_amplifiers_by_implicit_steps() -> None:
     )
 
 
+@every_law
+@pytest.mark.parametrize(("name", "periods"), [("op-amp", 20), ("H-bridge", 40)])
+def test_periodic_states_are_what_long_runs_come_to(name: str, periods: int, law: str) -> None:
+    circuit = fs.parse_netlist(deck(name))
+    found = fs.steady_state(circuit, charge_law=law)
+    period, start = found.period, found.solution.t[0]
+    times = periods * period + (found.solution.t - start)
+    run = fs.simulate(circuit, charge_law=law, t_stop=(periods + 1) * period, t_eval=times, rtol=1e-9)
+    assert apart(run.u_gap, found.solution.u_gap) <= 2e-8
+    assert found.defect <= 1e-6
+
+
+def test_the_periodic_state_of_an_rlc_has_its_amplitude_and_multipliers() -> None:
+    found = fs.steady_state(parse("V1 a 0 SIN(0 1 5k)\nR1 a b 10\nL1 b c 1m\nC1 c 0 1u\n.tran 1u 1m uic"), points=400)
+    s = 2j * np.pi * 5e3
+    t, v = found.solution.t, found.solution.node_voltages["c"]
+    wanted = (1.0 / (1.0 + 10e-6 * s + 1e-9 * s * s) * np.exp(s * t)).imag
+    np.testing.assert_allclose(v, wanted, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found.multipliers, math.exp(-5e3 / 5e3), rtol=1e-4)
+
+
+def test_an_unstable_circuit_is_refused_where_it_outgrows_all_digits() -> None:
+    with pytest.raises(fs.InputError, match="the circuit is unstable: by itself a voltage grows by a factor of e"):
+        fs.simulate(parse("V1 a 0 1\nR1 a b 1k\nC1 b 0 1n\nG1 0 b b 0 2m\n.tran 1u 1m uic"))
+    grows = fs.simulate(parse("V1 a 0 1\nR1 a b 1k\nC1 b 0 1u\nG1 0 b b 0 2m\n.tran 10u 5m uic"))
+    np.testing.assert_allclose(grows.node_voltages["b"], np.expm1(1e3 * grows.t), rtol=1e-7, atol=1e-6)
+
+
 def test_plans_say_that_steps_are_implicit() -> None:
     told = fs.plan(fs.parse_netlist(deck("transformer")))
     assert told.tier == "coupled"
