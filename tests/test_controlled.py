@@ -76,6 +76,28 @@ def inside_edges(text: str, t: np.ndarray) -> np.ndarray:
     return np.minimum(edges[after] - t, t - edges[after - 1]) < 1.1e-8
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_random_circuits_agree_with_ngspice(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    lines, coils, pick = ["V1 a 0 SIN(0 1 1k)", "Vs b c 0"], list[str](), lambda: random.choice(list("0abcd"), 2, False)
+    for i, kind in enumerate("RCLLEGFH"):
+        (p, n), (x, y), size = pick(), pick(), 10.0 ** random.uniform(-1.0, 0.5)
+        control = {"E": f"{x} {y}", "G": f"{x} {y}", "F": "Vs", "H": "Vs"}.get(kind, "")
+        unit = {"R": 1e3, "C": 1e-7, "L": 1e-2, "G": 1e-4, "H": 1e2}.get(kind, 0.3)
+        # A voltage source stands behind a resistor.
+        lines += [f"{kind}{i} {p} {n if kind in 'RCLGF' else f'x{i}'} {control} {size * unit!r}"]
+        lines += [f"Rx{i} x{i} {n} 50"] if kind in "EH" else []
+        coils += [f"L{i}"] if kind == "L" else []
+    lines += [f"K1 {' '.join(coils)} 0.8", *(f"Rg{node} {node} 0 100k" for node in "abcd"), ".tran 10u 1m uic"]
+    text = "\n".join(["t", *lines, ".end", ""])
+    ours = fs.simulate(fs.parse_netlist(text), rtol=1e-7)
+    theirs = run_ngspice(text, [f"v({node})" for node in ours.node_voltages], max_step=1e-7)
+    t, keep = np.unique(np.minimum(theirs["time"], 1e-3), return_index=True)
+    ours = fs.simulate(ours.circuit, t_eval=t[t > 1e-5], rtol=1e-7)
+    for node, v in ours.node_voltages.items():
+        assert np.abs(v - theirs[f"v({node})"][keep][t > 1e-5]).max() <= 1e-4 * max(1e-3, float(np.abs(v).max()))
+
+
 @every_law
 @pytest.mark.parametrize("name", DECKS)
 def test_stated_errors_are_met(name: str, law: str) -> None:
@@ -159,6 +181,18 @@ def test_phasors_are_those_of_the_closed_forms() -> None:
     np.testing.assert_allclose(gain, -ratio / (1.0 + (1.0 + ratio) / 1e5), rtol=1e-12)
 
 
+def test_sources_that_only_measure_a_current_leave_phasors_to_the_one_that_drives() -> None:
+    f = np.geomspace(10.0, 1e5, 9)
+    text = "t\nVin in 0 SIN(0 200 1k)\n{}R5 {} top 1k\nF1 0 mon Vs 2\nR1 mon 0 10k\n" + FINGER
+    measured = fs.parse_netlist(text.format("Vs in c 0\n", "c"))
+    plain = fs.parse_netlist(text.format("", "in").replace("F1 0 mon Vs 2\nR1 mon 0 10k\n", ""))
+    one, other = fs.phasor(measured, f), fs.phasor(plain, f)
+    np.testing.assert_allclose(one.u_gap, other.u_gap, rtol=1e-10)
+    np.testing.assert_allclose(one.impedance, other.impedance, rtol=1e-10)
+    coil = fs.phasor(parse("V1 a 0 AC 1\nR1 a b 10\nVs b c 0\nL1 c 0 1m"), f)
+    np.testing.assert_allclose(coil.impedance, 10.0 + 2e-3j * np.pi * f, rtol=1e-12)
+
+
 def test_the_operating_point_has_inductors_as_wires_and_amplifiers_with_their_gain() -> None:
     lines = "V1 a 0 5\nR1 a b 10\nL1 b c 1m\nR2 c 0 40\nC1 c 0 1u\nG1 0 d c 0 1m\nR3 d 0 1k\nE1 e 0 d 0 3\nR4 e 0 1k"
     run = fs.simulate(parse(f"{lines}\n.tran 1u 1m"))
@@ -215,6 +249,34 @@ def test_recordings_drive_amplifiers_by_implicit_steps() -> None:
     assert fs.simulate(circuit, sources={"Vin": samples}, t_stop=9e-3, rtol=1e-10).u_gap == pytest.approx(
         run.u_gap, abs=1e-5
     )
+
+
+@every_law
+@pytest.mark.parametrize(("name", "periods"), [("op-amp", 20), ("H-bridge", 40)])
+def test_periodic_states_are_what_long_runs_come_to(name: str, periods: int, law: str) -> None:
+    circuit = fs.parse_netlist(deck(name))
+    found = fs.steady_state(circuit, charge_law=law)
+    period, start = found.period, found.solution.t[0]
+    times = periods * period + (found.solution.t - start)
+    run = fs.simulate(circuit, charge_law=law, t_stop=(periods + 1) * period, t_eval=times, rtol=1e-9)
+    assert apart(run.u_gap, found.solution.u_gap) <= 2e-8
+    assert found.defect <= 1e-6
+
+
+def test_the_periodic_state_of_an_rlc_has_its_amplitude_and_multipliers() -> None:
+    found = fs.steady_state(parse("V1 a 0 SIN(0 1 5k)\nR1 a b 10\nL1 b c 1m\nC1 c 0 1u\n.tran 1u 1m uic"), points=400)
+    s = 2j * np.pi * 5e3
+    t, v = found.solution.t, found.solution.node_voltages["c"]
+    wanted = (1.0 / (1.0 + 10e-6 * s + 1e-9 * s * s) * np.exp(s * t)).imag
+    np.testing.assert_allclose(v, wanted, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found.multipliers, math.exp(-5e3 / 5e3), rtol=1e-4)
+
+
+def test_an_unstable_circuit_is_refused_where_it_outgrows_all_digits() -> None:
+    with pytest.raises(fs.InputError, match="the circuit is unstable: by itself a voltage grows by a factor of e"):
+        fs.simulate(parse("V1 a 0 1\nR1 a b 1k\nC1 b 0 1n\nG1 0 b b 0 2m\n.tran 1u 1m uic"))
+    grows = fs.simulate(parse("V1 a 0 1\nR1 a b 1k\nC1 b 0 1u\nG1 0 b b 0 2m\n.tran 10u 5m uic"))
+    np.testing.assert_allclose(grows.node_voltages["b"], np.expm1(1e3 * grows.t), rtol=1e-7, atol=1e-6)
 
 
 def test_plans_say_that_steps_are_implicit() -> None:

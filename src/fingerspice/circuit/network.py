@@ -34,7 +34,7 @@ from fingerspice.circuit.switching import Course
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import layer_gains, settled_areas
-from fingerspice.waveforms.waveform import Sum, Waveform, refuse, require
+from fingerspice.waveforms.waveform import OFF, Sum, Waveform, refuse, require
 
 _ROUNDING = 1e-13  # A current of a source that is this small, relative to what it is the difference of, is rounding.
 
@@ -166,6 +166,21 @@ class Network(Remembering):
             return other
 
         return self.remember(("switched", on), make, 64)
+
+    @property
+    def alone(self) -> Network:
+        """For phasors: the network of its one source, if the others are 0 V and only serve to measure currents."""
+        on = [i for i, e in enumerate(self.sources) if e.waveform != OFF or e.ac is not None]
+        # The voltages of nodes may follow what those measure.
+        read = self.senses and (not self.fingers or on[:1] >= [self.n_voltage])
+        if len(on) != 1 or len(self.sources) == 1 or read:
+            return self
+        columns = [*range(self.k.shape[1]), self.k.shape[1] + on[0]]
+        return replace(
+            self, sources=(self.sources[on[0]],), n_voltage=int(on[0] < self.n_voltage), q=self.q[:, on],
+            b=self.b[:, on], through=self.through[on], delivered=self.delivered[on][:, columns], lift=(), kept={},
+            resistor_factor_s=self.resistor_factor_s[:, on], nodes=self.nodes[:, columns],
+        )  # fmt: skip
 
     @cached_property
     def senses(self) -> bool:
@@ -528,7 +543,7 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
     known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
     require(finger is None or finger.lower() in gaps, "finger", repr(finger), f"the name of a GAP, {known}")
-    network = network_of(circuit)
+    network = network_of(circuit).alone
     refuse(not gaps, "a phasor solution needs a GAP; this circuit has none")
     names, problem = ", ".join(e.name for e in network.sources), "a phasor solution needs one source"
     refuse(len(network.sources) != 1, f"{problem}, whose amplitude it takes; this circuit has {names}")
@@ -553,7 +568,7 @@ def with_skin_held(circuit: Circuit) -> Circuit:
 
 def mean_areas(network: Network) -> FloatArray:
     """Areas of a coupled phasor at its source's fundamental, m^2, shape (n_area,); refused if there is none."""
-    if len(network.sources) > 1:
+    if len((network := network.alone).sources) > 1:
         what = "of one source at its fundamental, and this circuit has several sources"
     elif fundamental := network.waveforms[0].fundamental:
         return phasor_areas(network, "mean", fundamental.frequency, fundamental.amplitude)

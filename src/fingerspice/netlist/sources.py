@@ -212,6 +212,7 @@ def vocabulary() -> dict[str, list[str]]:
     for one in DEVICES.values():
         pairs = [p.name if p.default is None else f"{p.name}={p.default:g}" for p in one.parameters]
         given = " ".join(x if one.cells else "value" for x in pairs) if pairs else "[DC] value, AC ..., or a source"
+        given = "MODEL" if one.name == "S" else given
         letter = "X..." if one.cells else f"{one.name}..."
         heads = " ".join((*one.nodes, *one.control, *([one.name] if one.cells else [])))
         devices.append(f"{letter} {heads} {given}  ({one.what})")

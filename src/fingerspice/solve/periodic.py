@@ -17,7 +17,7 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.network import Modes
+from fingerspice.circuit.network import Modes, Network
 from fingerspice.engine.collocation import readout
 from fingerspice.numerics import linear
 from fingerspice.physics.contact import inverse_area
@@ -28,7 +28,7 @@ from fingerspice.solve.problem import Problem, joined, prepare, to_ends
 from fingerspice.solve.runs import no_period
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
 from fingerspice.waveforms.sampling import source_table
-from fingerspice.waveforms.waveform import OFF, Waveform, refuse, require
+from fingerspice.waveforms.waveform import OFF, Waveform, require
 
 # Number of equidistant times of a period from which the mean of an area with a time constant is computed.
 SAMPLES = 64
@@ -77,7 +77,7 @@ class Period:
         self.begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
         self.contacts = {i: one for i, one in enumerate(scene.network.contacts) if one is not None}
         # Modes of the circuit with its areas at 0 V, and their number.
-        self.modes: Modes = scene.modes
+        self.modes: Modes = _plain(scene.network, waveform.period) if scene.network.active else scene.modes
         n = self.n = self.modes.rates.size
         # (n_s,): Sources just before the period, V or A.
         self.before = np.array([float(w.value(self.begin, "left")) for w in scene.network.waveforms])
@@ -90,7 +90,12 @@ class Period:
         self.kept = np.where(self.neutral[:n], kept, 0.0)
         pushed = np.any(self.modes.gains[self.neutral[:n]] != 0.0)
         # The integrated span is one of so many parts of the period; its length, s.
-        turns = not pushed and not np.any(self.kept) and _turns(problem.network.waveforms, waveform.period)
+        turns = (
+            scene.network.course is None
+            and not pushed
+            and not np.any(self.kept)
+            and _turns(problem.network.waveforms, waveform.period)
+        )
         self.parts = 2 if turns else 1
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
@@ -172,6 +177,13 @@ class Period:
         return np.diag(np.exp(-self.rates * self.span * self.parts))
 
 
+def _plain(network: Network, period: float) -> Modes:
+    """In place of modes that may be complex, the live voltages themselves: what they forget in a period is measured."""
+    n, n_s = network.b.shape
+    nothing = np.zeros((n, n_s))
+    return Modes(np.full(n, 1.0 / period), nothing, np.eye(n), np.eye(n), nothing, np.zeros((n, len(network.cells))))
+
+
 def _turns(waves: tuple[Waveform, ...], period: float) -> bool:
     """Whether the second half period of every source is the first with opposite sign; then so are all voltages.
 
@@ -202,7 +214,12 @@ class Search(Period):
 
     def __init__(self, problem: Problem, rtol: float) -> None:
         super().__init__(problem)
-        problem, self.rtol, self.passes, self.implicit = self.problem, rtol, 0, self.problem.network.owned
+        problem, self.rtol, self.passes, self.implicit = (
+            self.problem,
+            rtol,
+            0,
+            self.problem.network.owned or self.problem.network.active,
+        )
         self.one: Track | March | None = None  # Integrates every pass by exponential steps
         # The gap voltage that a stack's area curve reaches, V; 0: that of its scene.
         self.top = 0.0
@@ -440,9 +457,8 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Period]:
     """
     if problem.network.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    needed = "a periodic state is found by modes that decay without oscillation, and this circuit has inductors or"
-    refuse(problem.network.active, f"{needed} amplifiers; allowed: a run of more periods, and phasor")
-    period = Search(problem, rtol) if problem.scene.coupled else Period(problem)
+    follows = problem.scene.coupled or problem.network.active
+    period = Search(problem, rtol) if follows else Period(problem)
     period.close()
     y, moved = np.append(period.start, np.zeros(period.before.size)), period.begin - problem.t_start
     started = dataclasses.replace(

@@ -43,6 +43,7 @@ TIERS = ("algebraic", "linear", "coupled")
 # A scene is called stiff if its fastest rate times the source's shortest time exceeds this: stability alone would then
 # limit the steps of an explicit method.
 STIFF = 300.0
+MOST_GROWN = 30.0  # Largest logarithm of the growth of an unstable circuit in a run
 REPEATS = "periodic: once a period no longer changes the state, later ones repeat it"
 STARTS = ("deck", "uncharged", "dc", "periodic")
 
@@ -215,7 +216,9 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
         _refuse(problem, chosen, best)
         reason = f"asked for; the lightest that is right would be {best}: {reason}"
     rates, shortest = scene.rates, min(problem.network.waveform.shortest_time(), span)
-    fastest = float(rates.max(initial=0.0))
+    fastest, grown = float(rates.max(initial=0.0)), -span * float(rates.min(initial=0.0))
+    said = f"the circuit is unstable: by itself a voltage grows by a factor of e^{grown:.3g} in {format_si(span, 's')}"
+    refuse(grown > MOST_GROWN, f"{said}; allowed: feedback of the other sign or with less gain, or a shorter run")
     reasons, stiff, needed = [reason], fastest * shortest > STIFF, 0.0
     if stiff:
         reasons.append(f"stiff: the fastest rate {fastest:.3g} 1/s against {1.0 / shortest:.3g} 1/s of the source")

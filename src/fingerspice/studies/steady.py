@@ -127,7 +127,7 @@ def phasor(
     circuit = overridden(circuit, sources, parameters)
     held = circuit if skin == "swept" else with_skin_held(circuit)
     scene = None if finger is None and not circuit.by_device("GAP") else linear_scene(held, finger)
-    network = build_network(held) if scene is None else scene.network
+    network = build_network(held).alone if scene is None else scene.network
     alone = len(network.sources) == 1
     fundamental = network.waveforms[0].fundamental if alone else None
     asked = frequency if frequency is not None or fundamental is None else fundamental.frequency
