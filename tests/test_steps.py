@@ -221,9 +221,15 @@ def test_run_writes_steps_and_analyses(command: Command) -> None:
     assert Path("out/steps.csv").read_text().splitlines()[0] == (
         "gap,u_gap_rms [V],f_el_mean [N],f_t_mean [N],most,status"
     )
-    refused = command("run", "steps.cir", "--raw")
+    assert command("run", "steps.cir", "--raw", "--overwrite").code == 0
+    raw = fs.read_raw("out/steps.raw")
+    assert list(raw.vectors)[:4] == ["time", "gap", "u_source", "@xgap[u_gap]"]
+    assert [float(raw.vectors["gap"][run][0]) for run in raw.steps] == [3e-6, -1e-6, 4e-6]
+    one = fs.simulate(deck().replace({"Xgap.d": 4e-6, "Xgap.r": 8e6 / 7.0}))
+    np.testing.assert_allclose(raw.vectors["@xgap[u_gap]"][raw.steps[2]], one.u_gap, rtol=0.0, atol=1e-6)
+    refused = command("run", "steps.cir", "--feel")
     assert refused.code == 2
-    assert "--raw goes with one run" in refused.err
+    assert "--feel goes with one run" in refused.err
     assert ".step has no effect in one run" in command("plan", "steps.cir").err
 
 

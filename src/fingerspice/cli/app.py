@@ -117,8 +117,8 @@ def run(
         return
     if circuit.steps:
         _alone("goes with one run, and the deck has .step; allowed: its values by --set",
-               raw=raw, feel=feel, schematic=schematic)  # fmt: skip
-        studies.stepped(job, circuit, how, csv, ends)
+               feel=feel, schematic=schematic)  # fmt: skip
+        studies.stepped(job, circuit, how, [".csv" if csv else ".nc", ".png", *([".raw"] if raw else []), *ends])
         return
     fingers: list[fs.Feel] = []
     refuse(feel and not circuit.by_device("GAP"), "--feel: the circuit has no GAP, so there is no friction to feel")

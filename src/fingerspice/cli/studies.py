@@ -45,12 +45,13 @@ def _report(job: Job, circuit: fs.Circuit, files: Mapping[str, str], make: Calla
     job.give(lambda: str(found), {end: getattr(found, method) for end, method in files.items()})
 
 
-def stepped(job: Job, circuit: fs.Circuit, how: Mapping[str, Any], csv: bool, ends: Iterable[str]) -> None:
+def stepped(job: Job, circuit: fs.Circuit, how: Mapping[str, Any], ends: Iterable[str]) -> None:
     """The part of `run` for a deck with `.step`: a table, a data file, and a family of curves."""
     from fingerspice.plots.picture import plot_steps
+    from fingerspice.results.rawfile import write_raw_steps
     from fingerspice.studies.steps import table_of
 
-    job.check_files(circuit, ".csv" if csv else ".nc", ".png", *ends)
+    job.check_files(circuit, *ends)
     said, others = beside_run(job, circuit)
     with paced("simulating the steps") as update:
         found = fs.run_steps(circuit, progress=update, **how)
@@ -64,7 +65,8 @@ def stepped(job: Job, circuit: fs.Circuit, how: Mapping[str, Any], csv: bool, en
     makes: Makes = {
         ".csv": lambda file: write_csv(file, list(columns), zip(*columns.values(), strict=True)),
         ".nc": lambda file: write_aside(file, lambda aside: kept.to_netcdf(aside, engine="h5netcdf")),
-        ".png": partial(plot_steps, found), **others,
+        ".png": partial(plot_steps, found),
+        ".raw": partial(write_raw_steps, found, [one.name for one in circuit.by_device("GAP")]), **others,
     }  # fmt: skip
     job.give(lambda: "\n\n".join([circuit.title, _first_rows(columns), *said]), makes)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,14 +18,18 @@ from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.results.measures import areas_of, currents_of, saved_columns
+from fingerspice.results.record import signal_of
 from fingerspice.waveforms.files import file_fault
 from fingerspice.waveforms.waveform import refuse
 
 if TYPE_CHECKING:
+    from xarray import Dataset
+
     from fingerspice.results.solution import Solution
 
 MOST_BYTES = 2**31  #: Of a raw file that is read.
 _KINDS = {"V": "voltage", "A": "current"}  # By unit; all else has no kind that SPICE knows
+_NOT_WRITTEN = ("u_source", "u_layer", "q_source", "i_source", "fold_margin")  # What nodes and sources' currents say
 _KEYS = "title date plotname flags command offset".split()  # noqa: SIM905
 
 
@@ -66,27 +71,43 @@ class Raw(Shown):
 def write_raw(solution: Solution, path: Path) -> Path:
     """See `Solution.to_raw`."""
     columns = {"time": (solution.t, "time")}
-    for name, (values, unit, _) in solution.signals.items():
-        key, _, element = name.partition(":")
-        if key == "v":
-            columns[f"v({element.lower()})"] = values, "voltage"
-        elif key not in ("u_source", "u_layer", "q_source", "i_source", "fold_margin"):
-            owner = element or (solution.gaps[0] if solution.gaps else "")
-            columns[f"@{owner.lower()}[{key}]" if owner else key] = values, _KINDS.get(unit, "notype")
     if solution.circuit.saved:
-        chosen = saved_columns(solution).items()
-        columns = {"time": (solution.t, "time")} | {"".join(name.lower().split()): (x, _KINDS.get(unit, "notype"))
-                                                    for name, (x, unit) in chosen}  # fmt: skip
-        return _written(solution, columns, path)
+        for name, (values, unit) in saved_columns(solution).items():
+            columns["".join(name.lower().split())] = values, _KINDS.get(unit, "notype")
+        return _written(solution.circuit.title, columns, path)
+    for name, (values, unit, _) in solution.signals.items():
+        if name.partition(":")[0] not in _NOT_WRITTEN:
+            columns[_vector(name, solution.gaps)] = values, _KINDS.get(unit, "notype")
     columns |= {f"v({node})": (x, "voltage") for node, x in areas_of(solution.record, solution.circuit).items()}
     columns |= {f"i({name})": (x, "current") for name, x in currents_of(solution.record, solution.circuit).items()}
-    return _written(solution, columns, path)
+    return _written(solution.circuit.title, columns, path)
 
 
-def _written(solution: Solution, columns: Mapping[str, tuple[NDArray[Any], str]], path: Path) -> Path:
+def write_raw_steps(found: Dataset, gaps: Sequence[str], path: Path) -> Path:
+    """Write the signals of `run_steps` of a circuit with these GAPs: run after run, with each step as a vector."""
+    steps = [str(name) for name in found.dims if name != "time"]
+    count = found.sizes["time"]
+    mesh = np.meshgrid(*(found[name].values for name in steps), indexing="ij")
+    columns = {"time": (np.tile(found["time"].values, mesh[0].size), "time")}
+    columns |= {name.lower(): (np.repeat(x.ravel(), count), "notype") for name, x in zip(steps, mesh, strict=True)}
+    for name, one in found.data_vars.items():
+        if "time" in one.dims:
+            columns[_vector(str(name), gaps)] = one.values.ravel(), _KINDS.get(one.attrs.get("units", ""), "notype")
+    return _written(found.attrs["title"], columns, path)
+
+
+def _vector(name: str, gaps: Sequence[str]) -> str:
+    """A signal's name in SPICE's words."""
+    key, _, element = name.partition(":")
+    owner = element or (gaps[0] if signal_of(name).of == "gap" else "")
+    return f"v({element.lower()})" if key == "v" else f"@{owner.lower()}[{key}]" if owner else key
+
+
+def _written(title: str, columns: Mapping[str, tuple[NDArray[Any], str]], path: Path) -> Path:
+    count = next(iter(columns.values()))[0].size
     head = [
-        f"Title: {solution.circuit.title}", "Date: -", "Plotname: Transient Analysis", "Flags: real",
-        f"No. Variables: {len(columns)}", f"No. Points: {solution.t.size}", "Variables:",
+        f"Title: {title}", "Date: -", "Plotname: Transient Analysis", "Flags: real",
+        f"No. Variables: {len(columns)}", f"No. Points: {count}", "Variables:",
         *(f"\t{k}\t{name}\t{kind}" for k, (name, (_, kind)) in enumerate(columns.items())), "Binary:", "",
     ]  # fmt: skip
     table = np.column_stack([values for values, _ in columns.values()]).astype("<f8")
@@ -111,7 +132,8 @@ def read_raw(path: str | Path, plot: int = 0) -> Raw:
     fault = file_fault(path, MOST_BYTES)
     refuse(fault, f"'{path}' {fault}")
     data, found = path.read_bytes(), list[Raw]()
-    # LTspice writes its header, and ASCII files as a whole, in UTF-16.
+    # LTspice writes its header, and ASCII files as a whole, in UTF-16, and others put its mark before it.
+    data = data.removeprefix(codecs.BOM_UTF16_LE)
     wide = data[1:2] == b"\0"
     at = 0
     while len(found) <= plot and data[at:].strip(b"\0\r\n \t"):
