@@ -62,7 +62,11 @@ def shown(value: float, unit: str) -> str:
     return format_si(value, unit) if unit in _PREFIXED else f"{value:.4g} {unit}".rstrip()
 
 
-PHASE_POLES = 2.0 * np.pi * 10.0 ** np.arange(0.5, 5.6, 0.5)  #: Of a constant-phase element, 1/s, but for the two ends.
+PHASE_STEP = math.log(10.0) * 2.0 / 3.0  #: Distance of a constant-phase element's poles, in ln s.
+PHASE_POLES = 2.0 * np.pi * np.exp(PHASE_STEP * np.arange(1.0, 9.0))  #: Those, 1/s, but for one beyond each end.
+# Where the ends begin behind the outer poles, in steps, and how much nearer than their first moments their poles are:
+# the largest error from 10 Hz to 100 kHz at all n_cpe is smallest with these, 0.36 %.
+_PHASE_ENDS, _NEARER = 0.42, 1.1
 Value = float | FloatArray
 #: Function from an element's values (in the netlist's units), or those of several scenes (n,), to its cells in series,
 #: shape (n_cell, 3) or (n_cell, 3, n): capacitance per area (F/m^2), total leakage (S) and leakage per area (S/m^2). At
@@ -152,16 +156,18 @@ def _dispersive_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
 
 
 def _phase_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
-    """Of 1/(q s^n), a sum of poles: with h = ln(10)/2 and b = sin(n pi)/(pi q), at poles x the sizes b h x^(1-n).
+    """Of 1/(q s^n), a sum of poles: with steps h and b = sin(n pi)/(pi q), at poles x the sizes b h x^(1-n).
 
-    Beyond the poles, and half a cell outside, one pole more at each end has the integral of b x^(-n)/(s + x) and its
-    first moment there. From 10 Hz to 100 kHz the element is exact to 0.5 %; phasors take q s^n itself.
+    Beyond the poles one pole more at each end has the integral of b x^(-n)/(s + x), and nearly its first moment there.
+    From 10 Hz to 100 kHz the element is exact to 0.4 %; phasors take q s^n itself.
     """
     n, q = (x[None] for x in np.broadcast_arrays(np.maximum(v["n_cpe"], 1e-6), v["q"]))
-    step, x = math.log(10.0) / 2.0, np.multiply.outer(PHASE_POLES, np.ones_like(n[0]))
-    low, high = x[:1] * math.exp(-0.5 * step), x[-1:] * math.exp(0.5 * step)
-    poles = np.concatenate([low * (1.0 - n) / (2.0 - n), x, high * (1.0 + n) / n])
-    sizes = np.concatenate([low ** (1.0 - n) / (1.0 - n), step * x ** (1.0 - n), high ** (1.0 - n) * (1.0 + n) / n**2])
+    x, near = np.multiply.outer(PHASE_POLES, np.ones_like(n[0])), _NEARER
+    low, high = x[:1] * math.exp(-_PHASE_ENDS * PHASE_STEP), x[-1:] * math.exp(_PHASE_ENDS * PHASE_STEP)
+    width = PHASE_STEP * np.array([0.5 + _PHASE_ENDS, *np.ones(PHASE_POLES.size - 2), 0.5 + _PHASE_ENDS])
+    poles = np.concatenate([near * low * (1.0 - n) / (2.0 - n), x, high * (1.0 + n) / (n * near)])
+    inner = width.reshape(-1, *[1] * (x.ndim - 1)) * x ** (1.0 - n)
+    sizes = np.concatenate([low ** (1.0 - n) / (1.0 - n), inner, high ** (1.0 - n) * (1.0 + n) / (n**2 * near)])
     c = q * np.pi / (np.sin(np.pi * n) * sizes)
     return _cells(c, poles * c, 0.0 * c)
 
