@@ -202,7 +202,7 @@ def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> No
         drawing.legend_within(ax, 44)
 
 
-_MOST_LINES, _MOST_PANELS = 60, 4  # Of a picture of steps
+_MOST_LINES, _MOST_PANELS, _MOST_MARKS = 60, 4, 12  # Of a picture of steps; marks at the values themselves
 
 
 def plot_steps(found: Dataset) -> Picture:
@@ -218,8 +218,7 @@ def plot_steps(found: Dataset) -> Picture:
     figure, axes = drawing.new_figure(len(names), height=1.0 + 1.4 * len(names), sharex=True)
     colour, *dashed = steps or [""]
     scale = found[colour].values if colour else np.zeros(1)
-    logarithmic = scale.min() > 0.0 and scale.max() > _WIDE * scale.min()
-    norm = (LogNorm if logarithmic else Normalize)(scale.min(), scale.max())
+    norm = (LogNorm if scale.min() > 0.0 and scale.max() > 5.0 * scale.min() else Normalize)(scale.min(), scale.max())
     # Without its brightest yellow, which is pale on white.
     palette = ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.92, 256)))
     wave = found.stack(line=steps) if steps else found.expand_dims("line")
@@ -239,13 +238,17 @@ def plot_steps(found: Dataset) -> Picture:
             ax.plot(factor_x * at, factor * values[k], color=palette(norm(place)), linewidth=1.0, linestyle=style)
         gap = f" {name.partition(':')[2]}" if ":" in name else ""
         drawing.dress(ax, f"{signal.axis}{gap} [{unit}]")
+        drawing.flat(ax, factor * values[np.isfinite(values)])
     drawing.dress(axes[-1], xlabel=f"{'Time' if over_time else x} [{unit_x}]" if unit_x else x)
     if colour:
         unit = found[colour].attrs.get("units", "")
         shown = EngFormatter(unit.replace("1", "")) if "^" not in unit else None
         bar = figure.colorbar(ScalarMappable(norm, palette), ax=axes, format=shown)
         bar.outline.set_visible(False)
-        bar.ax.set_title(colour, fontsize=drawing.FONT, loc="left", parse_math=False)
+        bar.set_label(colour, fontsize=drawing.FONT, parse_math=False)
+        bar.ax.minorticks_off()
+        if scale.size <= _MOST_MARKS:
+            bar.set_ticks(scale.tolist())
         bar.ax.tick_params(labelsize=drawing.FONT - 0.5)
     told = f"{lines.size:,} of {wave.line.size:,} runs" if lines.size < wave.line.size else f"{wave.line.size:,} runs"
     told += "".join(f"; dashes by {name}" for name in dashed[:1])
