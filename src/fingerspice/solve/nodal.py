@@ -270,7 +270,9 @@ def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:
         largest = float(np.abs(rough.rows[:, : problem.network.k.shape[0]]).max(initial=0.0))
         if not 0.0 < largest < math.inf or 0.05 * guess <= largest <= guess:
             break
-        guess = 1.5 * largest
+        near, guess = problem.network.active and largest <= guess / 0.05, 1.5 * largest
+        if near:
+            break
     return guess
 
 
