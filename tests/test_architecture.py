@@ -20,12 +20,12 @@ MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along. Contact laws raised them
 # by 1,243 where 1,200 were given; SPICE's directives have used 1,238 of 2,500, and controlled sources, inductors and
-# switches with two files 593 of them.
-ALL_LINES = 37_391
+# switches with two files 596 of them.
+ALL_LINES = 37_394
 ALL_FILES = 136
 PACKAGE_LINES = {
-    "base": 1_028, "circuit": 2_769, "cli": 1_486, "engine": 7_183, "explorer": 1_168, "netlist": 2_521,
-    "numerics": 1_170, "physics": 807, "plots": 1_243, "results": 3_166, "sets": 361, "solve": 5_461,
+    "base": 1_028, "circuit": 2_767, "cli": 1_486, "engine": 7_183, "explorer": 1_168, "netlist": 2_521,
+    "numerics": 1_170, "physics": 807, "plots": 1_243, "results": 3_166, "sets": 361, "solve": 5_466,
     "studies": 6_260, "torch": 375, "waveforms": 2_239,
 }  # fmt: skip
 
