@@ -128,9 +128,13 @@ def test_a_series_rlc_follows_its_closed_form(resistance: float) -> None:
 
 
 def test_an_lc_circuit_keeps_its_energy() -> None:
-    run = fs.simulate(parse("C1 a 0 1u IC=10\nL1 a b 1m IC=0.2\nVs b 0 0\n.tran 1u 10m uic"), rtol=1e-10)
+    run = fs.simulate(
+        parse("C1 a 0 1u IC=10\nL1 a b 1m IC=0.2\nVs b 0 0\n.tran 1u 10m uic\n.meas tran highest MAX I(L1)"), rtol=1e-10
+    )
     u, i = run.node_voltages["a"], -run.i_source
     energy = 0.5e-6 * u**2 + 0.5e-3 * i**2
+    highest = math.hypot(0.2, 10.0 / math.sqrt(1e3))
+    assert run.measures["highest"] == pytest.approx(highest, rel=1e-9)
     np.testing.assert_allclose(energy, energy[0], rtol=1e-10)
     w, z = 1.0 / math.sqrt(1e-9), math.sqrt(1e3)
     np.testing.assert_allclose(u, 10.0 * np.cos(w * run.t) - 0.2 * z * np.sin(w * run.t), rtol=0, atol=1e-9)

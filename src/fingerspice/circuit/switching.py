@@ -77,6 +77,8 @@ def _between(
     """Times (m,) at which a voltage passes its levels (m,) between two times each, s."""
     for _ in range(_HALVINGS):
         middle = 0.5 * (begin + end)
+        if not np.any((begin < middle) & (middle < end)):
+            break
         u = value(middle)
         beyond = np.where(rising, u > level, u < level)
         begin, end = np.where(beyond, begin, middle), np.where(beyond, middle, end)

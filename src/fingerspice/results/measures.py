@@ -17,11 +17,11 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.measures import LAST, PARTS, Crossing, Measure, Quantity, Vector
 from fingerspice.circuit.network import network_of
 from fingerspice.numerics.lobatto import NODES, POINTS, TO_SERIES
-from fingerspice.results.record import Signals, signal_of
+from fingerspice.results.record import Record, Signals, signal_of
 from fingerspice.results.steps import WEIGHTS, Outputs, Stretch, Weighed, weigh_outputs
 
 if TYPE_CHECKING:
-    from fingerspice.circuit.circuit import Circuit
+    from fingerspice.circuit.circuit import Circuit, Element
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import PhasorSolution
 
@@ -75,8 +75,10 @@ def _vector(solution: Solution, vector: Vector) -> Callable[[Signals], FloatArra
     if element.device == "R":
         across = _vector(solution, Vector("v", element.nodes))
         return lambda record: across(record) / element.values["value"]
+    if element.device == "L":
+        return _of_inductor(circuit, element)
     if element.device not in "VI":
-        raise Failed(f"I({element.name}) of a {element.device} is no signal; allowed: of a V, an I or an R")
+        raise Failed(f"I({element.name}) of a {element.device} is no signal; allowed: of a V, an I, an R or an L")
 
     def current(record: Signals) -> FloatArray:
         if first not in (found := currents_of(record, circuit)):
@@ -102,6 +104,19 @@ def saved_columns(solution: Solution) -> dict[str, tuple[FloatArray, str]]:
         except Failed:
             found[one.text] = np.full(solution.t.size, math.nan), unit
     return found
+
+
+def _of_inductor(circuit: Circuit, element: Element) -> Callable[[Signals], FloatArray]:
+    """The current of an inductor from its p node on, A."""
+    network, names = network_of(circuit), [e.name for e in circuit.by_device("L")]
+    (count, coils), end = network.coils.shape, network.k.shape[0]
+
+    def current(record: Signals) -> FloatArray:
+        if count < coils or not isinstance(record, Record):
+            raise Failed(f"I({element.name}) is not known; allowed: of a V element of 0 V in series")
+        return np.asarray(record.rows[:, end - count : end] @ np.linalg.inv(network.coils)[names.index(element.name)])
+
+    return current
 
 
 def areas_of(record: Signals, circuit: Circuit) -> dict[str, FloatArray]:

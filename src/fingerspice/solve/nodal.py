@@ -82,7 +82,7 @@ class Collocation(Integration):
         self.control[implicit.BASE] = problem.t_start
         if problem.network.active:
             # A step longer than the fastest mode would be tested at its end only, where that has decayed.
-            fastest = max(abs(problem.network.decay(problem.scene.net.area0)), default=math.inf)
+            fastest = max(abs(problem.scene.decay), default=math.inf)
             self.control[[implicit.H, implicit.H_AFTER_JUMP]] = 1.0 / max(fastest, 1e-300)
         self.peaks = np.zeros(self.net.gap.size)
         self.room = new_room(self.net, self.y.size)
@@ -270,7 +270,9 @@ def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:
         largest = float(np.abs(rough.rows[:, : problem.network.k.shape[0]]).max(initial=0.0))
         if not 0.0 < largest < math.inf or 0.05 * guess <= largest <= guess:
             break
-        guess = 1.5 * largest
+        near, guess = problem.network.active and largest <= guess / 0.05, 1.5 * largest
+        if near:
+            break
     return guess
 
 

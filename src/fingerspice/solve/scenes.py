@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, Remembering
+from fingerspice.base.arrays import ComplexArray, FloatArray, Remembering
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import COUPLING, freezing_error
 from fingerspice.circuit.network import Modes, Network, loop_network, mean_areas, network_modes, network_of
@@ -89,10 +89,15 @@ class Scene(Remembering):
         return self.modes_at(self.net.area0)
 
     @cached_property
+    def decay(self) -> ComplexArray:
+        """As `Network.decay`, at the same areas."""
+        return self.network.decay(self.net.area0)
+
+    @cached_property
     def rates(self) -> FloatArray:
         """Decay rates of these modes, 1/s; of modes that may oscillate, the real parts."""
         if self.network.active:
-            return np.asarray(self.network.decay(self.net.area0).real)
+            return np.asarray(self.decay.real)
         if self.model is None:
             return self.modes.rates
         rates, _, _, _ = modes(self.model.rate + self.model.rate0 / self.model.area0, self.model.k)
