@@ -19,11 +19,12 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along. Contact laws raised them
-# by 1,243 where 1,200 were given; SPICE's directives have used 1,238 of 2,500.
-ALL_LINES = 36_798
-ALL_FILES = 134
+# by 1,243 where 1,200 were given; SPICE's directives have used 1,238 of 2,500;
+# compiled code that comes with wheels, and `warm`, 174 of 250, and one file.
+ALL_LINES = 36_972
+ALL_FILES = 135
 PACKAGE_LINES = {
-    "base": 1_028, "circuit": 2_388, "cli": 1_486, "engine": 7_182, "explorer": 1_168, "netlist": 2_462,
+    "base": 1_085, "circuit": 2_388, "cli": 1_600, "engine": 7_182, "explorer": 1_168, "netlist": 2_462,
     "numerics": 1_170, "physics": 807, "plots": 1_229, "results": 3_137, "sets": 361, "solve": 5_368,
     "studies": 6_244, "torch": 375, "waveforms": 2_239,
 }  # fmt: skip
