@@ -38,7 +38,7 @@ $(VENV)/.docs: pyproject.toml | $(BIN)/python
 run: $(VENV)/.run
 	$(BIN)/fingerspice run $(DECK) --out out
 
-# A wheel with all compiled code (docs/installing.md), out/dist/*.whl; three minutes a level on two cores.
+# A wheel with all compiled code (docs/installing.md), out/dist/*.whl; five minutes a level on two cores.
 wheel: $(VENV)/.run
 	rm -rf out/objects out/dist
 	for level in $(LEVELS); do echo "compiling for $$level ..."; NUMBA_CACHE_DIR=out/objects \

@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 V2 = {"NUMBA_CPU_NAME": "x86-64-v2", "NUMBA_CPU_FEATURES": ""}
-# It compiles everything for one level, three minutes on two cores.
+# It compiles everything for one level, five minutes on two cores.
 pytestmark = [
     pytest.mark.skipif("CI" not in os.environ, reason="it takes minutes; CI=true runs it"),
     pytest.mark.skipif(platform.machine() != "x86_64", reason="levels of x86-64"),
