@@ -226,8 +226,7 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
         values = _device_values(own, read.get("law"), notes)
     element = Element(name, device, nodes, names, MappingProxyType(values), where=where, **read)
     for parameter, text in unusual(element):
-        own_value = parameter in values and len(values) == 1
-        given = statement.body[0] if own_value and statement.body else params.get(parameter)
+        given = statement.body[0] if statement.body and parameter in values else params.get(parameter)
         # One warning per number is enough.
         if not (isinstance(given, Number) and any(_doubts(given, element.spec.parameter(parameter)))):
             notes.append(f"{where if given is None else given.where}: {text}")
