@@ -376,9 +376,8 @@ def test_what_is_built_on_private_classes_of_numba_does_what_it_is_for(tmp_path:
         "assert not made.inner.signatures and not made.row.signatures\n"
         "print(sum(made.outer.stats.cache_hits.values()))"
     )
-    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
-    environment["PYTHONPATH"] = str(Path(fs.__file__).parents[1])
-    command = [sys.executable, "-c", code]
+    own = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(fs.__file__).parents[1])}
+    environment, command = os.environ | own, [sys.executable, "-c", code]
     found = [subprocess.check_output(command, text=True, env=environment) for _ in range(2)]
     assert found == ["0\n", "1\n"]
 
