@@ -95,16 +95,10 @@ def two_scales(u: FloatArray, v: Values) -> FloatArray:
 
     A = A0 - (c2 / A0) F_T^2, and F_T grows with A, so that there is one root.
     """
-    from fingerspice.physics.contact import universal_curve_array
-
-    x, at_rest = paper_constants(v)
-    m, n = float(np.max(v["m_exp"])), float(np.max(v["n_exp"]))
-    adhesive = at_rest * universal_curve_array(x * u, 1.0 / m, 0.5 * (1.0 + 1.0 / m - 1.0 / n))
-
     def missing(a: FloatArray, most: FloatArray, s: FloatArray, load: FloatArray, c: FloatArray, p: FloatArray) -> Any:
         return a - most + c / most * (p * _real_area(load + s * a, a, p)) ** 2
 
-    loss = v["c2"] * (_FRICTION * np.asarray(v["mu"])) ** 2
+    adhesive, loss = paper(u, {**v, "c2": 0.0}), v["c2"] * (_FRICTION * np.asarray(v["mu"])) ** 2
     return root(missing, 1e-9 * adhesive, adhesive, adhesive, stress(u, v), v["fn"], loss, v["p_sat"])
 
 
