@@ -95,6 +95,7 @@ def two_scales(u: FloatArray, v: Values) -> FloatArray:
 
     A = A0 - (c2 / A0) F_T^2, and F_T grows with A, so that there is one root.
     """
+
     def missing(a: FloatArray, most: FloatArray, s: FloatArray, load: FloatArray, c: FloatArray, p: FloatArray) -> Any:
         return a - most + c / most * (p * _real_area(load + s * a, a, p)) ** 2
 
