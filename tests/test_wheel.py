@@ -58,10 +58,8 @@ scene(EXAMPLES[0]["request"])
 TOLD = "print(json.dumps({'compiled': compiled, 'found': list(map(float, found))}))"
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(folder: Path) -> Path:
     """A folder where the wheel is installed: all code for x86-64-v3, and a stack's for x86-64-v2."""
-    folder = tmp_path_factory.mktemp("wheel")
     kept = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "objects"), "NUMBA_CPU_FEATURES": ""}
     fingerspice = [sys.executable, "-m", "fingerspice"]
     stack = ["run", str(ROOT / "circuits" / "fingerpad.cir"), "--out", str(folder), "--no-plot"]
@@ -96,20 +94,17 @@ def counted(site: Path, code: str, more: Mapping[str, str] = {}) -> dict[str, An
     return answer
 
 
-def test_from_the_wheel_nothing_is_compiled(site: Path) -> None:
+def test_from_the_wheel_nothing_is_compiled(tmp_path: Path) -> None:
+    """One test, as of several workers each would make the wheel: every kind of run, the command, and another level."""
+    site = installed(tmp_path)
     assert counted(site, STACK + EVERY)["compiled"] == []
-
-
-def test_the_command_draws_its_picture_without_a_compilation(site: Path, tmp_path: Path) -> None:
     run = ["run", str(ROOT / "circuits" / "fingerpad.cir"), "--out", str(tmp_path)]
     code = f"import sys; sys.argv[1:] = {run!r}\nfrom fingerspice.__main__ import main\nmain()\n"
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, check=True, env=environment(site), capture_output=True, text=True)
     assert "compiling" not in done.stderr
     assert (tmp_path / "fingerpad.png").stat().st_size > 10_000
-
-
-def test_code_without_avx2_gives_the_same_figures_and_compiles_nothing(site: Path) -> None:
+    # A processor without AVX2 has the same figures to the stated error.
     wide, narrow = counted(site, STACK), counted(site, STACK, V2)
     assert narrow["compiled"] == wide["compiled"] == []
     largest = max(map(abs, wide["found"]))
