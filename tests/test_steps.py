@@ -67,6 +67,7 @@ def test_forms_of_step(line: str, values: list[float]) -> None:
         ([f".step {p} list 1 2" for p in ("gap", "R", "V", "Xcoat.d")], "4 .step lines; allowed: three"),
         ([".dc V1 0 1"], "increment"),
         ([".dc"], "what is stepped"),
+        ([".dc V1 0 1 1"] * 2, ".dc is given twice"),
     ],
 )
 def test_bad_steps(lines: list[str], said: str) -> None:
@@ -253,6 +254,15 @@ C1 c 0 CM 1u
 .temp 77
 .end
 """
+
+
+def test_an_elements_name_alone_is_its_one_value() -> None:
+    """Of an R its resistance, of a controlled source its gain."""
+    body = "gains\nV1 a 0 1\nR1 a b 1k\nR2 b 0 1k\nE1 c 0 b 0 2\nR3 c 0 1k\n"
+    found = fs.operating_points(fs.parse_netlist(f"{body}.dc E1 1 3 1 R2 1k 3k 2k\n.end\n"))
+    assert found["E1.gain"].values.tolist() == [1.0, 2.0, 3.0]
+    expected = np.outer([1.0, 2.0, 3.0], [0.5, 0.75])
+    np.testing.assert_allclose(found["v:c"], expected, rtol=1e-12)
 
 
 def test_values_follow_the_temperature_as_in_ngspice(tmp_path: Path) -> None:

@@ -338,8 +338,9 @@ def _stepped(words: _Line) -> Step:
     if key in words.params and not key.endswith("("):
         return Step(key, (), True)
     known = {f"{e.name}.{name}".lower(): f"{e.name}.{name}" for e in words.elements for name in e.parameters}
-    known |= {e.name.lower(): e.name if e.device in "VI" else f"{e.name}.value" for e in words.elements
-              if len(e.device) == 1}  # fmt: skip
+    # The name alone of a source is its level, and of an element with one value that value.
+    known |= {e.name.lower(): e.name for e in words.elements if e.device in ("V", "I")}
+    known |= {e.name.lower(): f"{e.name}.{name}" for e in words.elements if len(e.values) == 1 for name in e.values}
     hint = nearest(key, [*known, *(one for one in words.params if not one.endswith("("))])
     allowed = "a .param, a source, or a path such as Xgap.d"
     refuse(key not in known, f"{words.name} {written!r} is not there{hint}; allowed: {allowed}", place)

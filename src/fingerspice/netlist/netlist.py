@@ -109,6 +109,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
             case ".step":
                 steps.append(read_step(line, start, deck.params, elements))
             case ".dc":
+                refuse(dc, ".dc is given twice; allowed: one line, with two that are swept", line.where())
                 dc = read_dc(line, start, deck.params, elements)
             case ".meas" | ".measure":
                 measures.append(read_measure(line, start, deck.params, elements, measures))
