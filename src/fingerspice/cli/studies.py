@@ -63,12 +63,16 @@ def stepped(job: Job, circuit: fs.Circuit, how: Mapping[str, Any], ends: Iterabl
     known = {key: value for key, value in found.attrs.items() if value != []}
     kept = found.drop_attrs(deep=False).assign_attrs({**known, "deck": circuit.text, **job.about})
     makes: Makes = {
-        ".csv": lambda file: write_csv(file, list(columns), zip(*columns.values(), strict=True)),
+        ".csv": partial(_write_columns, columns),
         ".nc": lambda file: write_aside(file, lambda aside: kept.to_netcdf(aside, engine="h5netcdf")),
         ".png": partial(plot_steps, found),
         ".raw": partial(write_raw_steps, found, [one.name for one in circuit.by_device("GAP")]), **others,
     }  # fmt: skip
     job.give(lambda: "\n\n".join([circuit.title, _first_rows(columns), *said]), makes)
+
+
+def _write_columns(columns: Mapping[str, Any], file: Path) -> Path:
+    return write_csv(file, list(columns), zip(*columns.values(), strict=True))
 
 
 _FIRST = 40  # Most rows of a table of steps that are printed
@@ -115,7 +119,7 @@ def beside_run(job: Job, circuit: fs.Circuit) -> tuple[list[str], Makes]:
         swept = fs.operating_points(circuit, charge_law=job.charge_law)
         rows, columns = table_of(swept)
         job.answer.update(dc=rows)
-        makes["_dc.csv"] = lambda file: write_csv(file, list(columns), zip(*columns.values(), strict=True))
+        makes["_dc.csv"] = partial(_write_columns, columns)
         makes["_dc.png"] = partial(plot_steps, swept)
     if circuit.ac is not None:
         from fingerspice.plots.traces import plot_phasor

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +31,7 @@ from fingerspice.studies.batch.batch import (
     STATUS_NAMES,
     batch,
     checked_scenes,
+    processors,
 )
 from fingerspice.waveforms.waveform import DC, refuse, require
 
@@ -226,7 +226,7 @@ def _found(
             progress(next(done) / len(rows))
 
     # Filters of warnings apply to all threads.
-    with warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(os.cpu_count()) as pool:
+    with warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(processors()) as pool:
         list(pool.map(one, range(len(scenes))))
     refuse(len(failures) == len(rows), f"no step has a result; the first: {failures.get(0)}")
     t = max((row["time"][1] for row in rows if "time" in row), key=np.size, default=np.empty(0))

@@ -261,8 +261,7 @@ def batch(
         require_card()
     task = Task(circuit, outputs, rtol, t_stop, periods, periodic, points, device)
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
-    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    threads = own if threads is None else whole_number("threads", threads, 1)
+    threads = processors() if threads is None else whole_number("threads", threads, 1)
     scenes = checked_scenes(circuit, parameters)
     task.scenes, skins = dict(scenes), circuit.by_device("SKIN")
     n = task.n = next(iter(scenes.values())).size
@@ -306,6 +305,11 @@ def batch(
         held = ", ".join(f"{e.name}.f" for e in skins)
         said = f"the skin's data are those at its own {held}{', whatever the source frequency is' if varied else ''}"
     return _dataset(task, slopes, scenes, said, "cpu" if why or recorded else task.device)
+
+
+def processors() -> int:
+    """Number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> None:
