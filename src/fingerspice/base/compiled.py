@@ -28,6 +28,7 @@ from numba.core.caching import CompileResultCacheImpl, IndexDataCacheFile, NullC
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult, Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.compiler_machinery import PassManager
 from numba.core.datamodel import models
 from numba.core.datamodel.registry import register_default
 from numba.core.runtime.nrt import rtsys
@@ -200,14 +201,19 @@ def _call_type(function: Any, context: Any, args: Any, kws: Any) -> Any:
 
 @contextmanager
 def _swiftly() -> Iterator[None]:
-    """Context of a compilation, without collection of cycles: it makes millions of objects that live until it ends."""
+    """Context of a compilation, without collection of cycles: it makes millions of objects that live until it ends.
+
+    Nor does numba look for live variables after every pass that changed a function: passes do that where they need it.
+    """
     looking = gc.isenabled()
     gc.disable()
+    cast(Any, PassManager)._ENFORCING = False
     cast(Any, BaseFunction).get_call_type = _call_type
     try:
         yield
     finally:
         cast(Any, BaseFunction).get_call_type = _find
+        cast(Any, PassManager)._ENFORCING = True
         if looking:
             gc.enable()
 
@@ -254,8 +260,9 @@ def _cached(*, noalias: bool = False, **options: Any) -> Callable[[Function], Fu
     """`njit` with a cache; `noalias`: where compiled code calls it, it writes to no memory that it reads."""
 
     def compile_when_called(function: Function) -> Function:
-        # numba would take options that are missing here from whichever caller comes first.
-        compiled = njit(**{"error_model": "numpy", "nogil": True, "fastmath": False, **options})(function)
+        # numba would take options that are missing here from whichever caller comes first. No C code calls a function.
+        always = {"error_model": "numpy", "nogil": True, "fastmath": False, "no_cfunc_wrapper": True}
+        compiled = njit(**{**always, **options})(function)
         compiled._cache = _Cache(function)
         compile_signature = compiled.compile
 

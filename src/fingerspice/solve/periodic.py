@@ -267,8 +267,8 @@ class Search(Period):
 
     def _largest(self, z: FloatArray) -> float:
         """Largest voltage in a change of z, V; the relative change of an area counts as that share of the scale."""
-        x, areas = np.abs(self.modes.shape @ z[: self.n]).max(initial=0.0), z[self.n :]
-        return float(max(x, self.scale * np.abs(areas).max()) if areas.size else x)
+        x, areas = self.modes.shape @ z[: self.n], self.scale * z[self.n :]
+        return max(map(abs, [*x.tolist(), *areas.tolist()]), default=0.0)
 
     def passed(self, z: FloatArray, tol: float) -> _Pass:
         """One pass over the period from z, with an error of `tol` times the voltage scale in every step."""
@@ -281,8 +281,8 @@ class Search(Period):
             self.implicit, made = True, self._collocated(dataclasses.replace(self.problem, initial=initial), tol)
         # Use the sources at the end of the pass: they equal those at the start only up to the sign and round-off.
         x = self.modes.inverse @ (made.end[:n] + self.modes.follow @ made.sources)
-        error = np.append(self.modes.inverse @ made.error[:n], made.error[n : z.size])
-        return made._replace(end=self.turned * np.append(x, made.end[n : z.size]), error=error)
+        error = np.concatenate([self.modes.inverse @ made.error[:n], made.error[n : z.size]])
+        return made._replace(end=self.turned * np.concatenate([x, made.end[n : z.size]]), error=error)
 
     def _stepped(self, initial: State, tol: float) -> _Pass | None:
         """One pass by exponential steps; None where they fail before the end."""

@@ -49,7 +49,7 @@ def model_of(scene: Scene) -> Model:
 def to_loop(scene: Scene, state: State) -> tuple[FloatArray, float]:
     """A stack's state in its own equations, x (V) and last z (C), (n + 1,), and the gap voltage along the loop, V."""
     model, y = model_of(scene), state.y.copy()
-    if not state.y.any() and not state.s_before.any():
+    if not any(state.y.tolist()) and not any(state.s_before.tolist()):
         return y, 0.0
     before, along = float(state.s_before[0]), scene.turn * state.y[:-1]
     u_gap = float(np.einsum("k,k->", along[: model.gap.size], model.gap))

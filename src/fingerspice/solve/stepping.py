@@ -100,7 +100,7 @@ class Stepping(Integration):
         self.controls, self.step = np.zeros(1, readout.CONTROL), np.zeros(1, readout.STEP)
         self.control = self.controls[0]
         self.control["t"], self.control["margin"], self.control["magnified"] = self.problem.t_start, 1.0, 1.0
-        self.branch = np.full((self.net.gap.size, 2), [self.problem.t_start, math.inf])  # As in `LoopState`
+        self.branch = np.array([self.problem.t_start, math.inf] * self.net.gap.size).reshape(-1, 2)  # As in `LoopState`
         self.counters, self.error = np.zeros(readout.N_COUNTERS, np.int64), np.zeros(self.n_error)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
         self.y[:], self.s_before[:], self.sign[:] = initial.y, initial.s_before, initial.sign
