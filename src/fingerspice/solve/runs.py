@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
-from fingerspice.base.errors import InputError
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
-from fingerspice.circuit.describe import circuit_warnings, course_warnings, spectrum_warning
+from fingerspice.circuit.describe import circuit_warnings, course_warnings, option_notes, spectrum_warning
 from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.statespace import driving
 from fingerspice.engine.collocation.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
@@ -27,6 +28,9 @@ from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, se
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.sampling import Function, breakpoints_at
 from fingerspice.waveforms.waveform import DOUBLE, Sum
+
+if TYPE_CHECKING:
+    from fingerspice.results.solution import Solution
 
 Progress = Callable[[float], None]
 
@@ -314,7 +318,8 @@ def refuse_beyond_law(problem: Problem, area: int, u: float, when: str = "") -> 
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Warnings for every limit of the model that the run exceeds."""
     success, several, net = run.status is Status.SUCCESS, len(record.fingers) > 1, problem.scene.net
-    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
+    circuit = problem.circuit
+    yield from (*circuit.warnings, *option_notes(circuit), *circuit_warnings(circuit, problem.t_stop))
     key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
     yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
     waves = problem.network.waveforms
@@ -364,6 +369,13 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
             if field > strength:
                 met = f"the field in {layer.name} reaches {field:.3g} V/m at the outputs"
                 yield f"{met}; its dielectric strength is {strength:.3g} V/m"
+
+
+def warn(solution: Solution, level: int) -> None:
+    """Issue a run's warnings but for its circuit's own, issued when that was read, and notes of options."""
+    quiet = (*solution.circuit.warnings, *option_notes(solution.circuit))
+    for text in [text for text in solution.warnings if text not in quiet]:
+        warnings.warn(text, FingerspiceWarning, stacklevel=level + 1)
 
 
 def _source_warnings(problem: Problem) -> Iterator[str]:
