@@ -149,7 +149,7 @@ def at_parameters(circuit: Circuit, values: Mapping[str, float]) -> Circuit:
             name: getattr(own, name) for name in ("waveform", "ac", "law") if getattr(own, name) != getattr(was, name)
         }
         elements.append(own if was == now else replace(now, **kept))
-    same = {name: getattr(new, name) for name in ("tran", "initial", "measures", "fourier")
+    same = {name: getattr(new, name) for name in ("tran", "ac", "initial", "measures", "fourier")
             if getattr(circuit, name) == getattr(old, name)}  # fmt: skip
     changed = circuit._with(elements=tuple(elements), **same)
     check(changed)
