@@ -21,12 +21,12 @@ MAX_LINES = 600
 # lowered; what moves from one package to another takes its lines along. Contact laws raised them
 # by 1,243 where 1,200 were given, SPICE's directives and devices by 2,736 where 2,500 were, and compiled code that
 # comes with wheels by 174 of 250.
-ALL_LINES = 38_548
+ALL_LINES = 38_525
 ALL_FILES = 134
 PACKAGE_LINES = {
-    "base": 1_091, "circuit": 2_805, "cli": 1_725, "engine": 7_183, "explorer": 1_167, "netlist": 2_736,
-    "numerics": 1_170, "physics": 802, "plots": 1_304, "results": 3_343, "sets": 361, "solve": 5_474,
-    "studies": 6_613, "torch": 375, "waveforms": 2_239,
+    "base": 1_091, "circuit": 2_805, "cli": 1_724, "engine": 7_183, "explorer": 1_167, "netlist": 2_723,
+    "numerics": 1_170, "physics": 802, "plots": 1_304, "results": 3_341, "sets": 361, "solve": 5_472,
+    "studies": 6_608, "torch": 375, "waveforms": 2_239,
 }  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.

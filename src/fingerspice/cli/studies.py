@@ -89,9 +89,8 @@ _FIRST = 40  # Most rows of a table of steps that are printed
 
 def _first_rows(columns: Mapping[str, Any]) -> str:
     """The first rows of columns of numbers and words, as a table."""
-    rows = [
-        *zip(*([x if isinstance(x, str) else f"{x:.6g}" for x in column] for column in columns.values()), strict=True)
-    ]
+    cells = ([x if isinstance(x, str) else f"{x:.6g}" for x in column] for column in columns.values())
+    rows = [*zip(*cells, strict=True)]
     more = [f"... {len(rows) - _FIRST:,} more rows"] if len(rows) > _FIRST else []
     return "\n".join([Table(tuple(columns), rows[:_FIRST], left=0).text(), *more])
 

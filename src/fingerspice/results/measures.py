@@ -195,9 +195,8 @@ class _Course:
 
     def weighed(self, longest: float = math.inf) -> Weighed:
         """Values with weights for means, on pieces of at most `longest` (s)."""
-        return (
-            self.span.weigh(self.values, longest) if isinstance(self.span, Stretch) else weigh_outputs(self.t, self.x)
-        )
+        span = self.span
+        return span.weigh(self.values, longest) if isinstance(span, Stretch) else weigh_outputs(self.t, self.x)
 
     def extreme(self, sign: float) -> tuple[float, float]:
         """Time (s) and value of the largest value, or with the sign -1 of the smallest."""
@@ -286,9 +285,8 @@ def _part(found: PhasorSolution, vector: Vector) -> FloatArray:
     if vector.kind == "u_gap":
         return np.abs(found.u_gap)
     if vector.kind not in ("area", "f_el"):
-        raise Failed(
-            f"{vector.kind} of {', '.join(vector.names)} is no part of a sweep; allowed: V, VM, VDB, VP, VR, VI"
-        )
+        of = f"{vector.kind} of {', '.join(vector.names)}"
+        raise Failed(f"{of} is no part of a sweep; allowed: V, VM, VDB, VP, VR, VI")
     return found.area if vector.kind == "area" else found.f_el_mean
 
 

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -23,14 +23,12 @@ from fingerspice.engine.network import Sources, rates_at
 from fingerspice.physics.contact import LawContact, inverse_area
 from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, State, Status, last_tried
 from fingerspice.results.record import Record
+from fingerspice.results.solution import Solution
 from fingerspice.results.steps import ClosedForm, Recorded
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, shortest_event, values_at
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.sampling import Function, breakpoints_at
 from fingerspice.waveforms.waveform import DOUBLE, Sum
-
-if TYPE_CHECKING:
-    from fingerspice.results.solution import Solution
 
 Progress = Callable[[float], None]
 

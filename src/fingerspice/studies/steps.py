@@ -100,11 +100,12 @@ def run_steps(
     def kept(scene: Circuit) -> dict[str, Row]:
         run = simulate(scene, jumps="none", **options)
         names = [one for key in signals for one in run.record.names(key)]
-        row: dict[str, Row] = {name: (("time",), run.record.one(name), _unit(name)) for name in names}
+        units = {name: {"units": signal_of(name).unit} for name in (*names, *(OUTPUTS[name][0] for name in outputs))}
+        row: dict[str, Row] = {name: (("time",), run.record.one(name), units[name]) for name in names}
         row["time"] = ("time",), run.t, {"units": "s"}
         for name in outputs:
             value = np.asarray(run._figure(*OUTPUTS[name]), float)
-            row[name] = ("gap",)[: value.ndim], value, _unit(OUTPUTS[name][0])
+            row[name] = ("gap",)[: value.ndim], value, units[OUTPUTS[name][0]]
         return row | {name: ((), np.array(value), {}) for name, value in run.measures.items()}
 
     tran = circuit.tran
@@ -198,10 +199,8 @@ def table_of(found: Dataset) -> tuple[list[dict[str, Any]], dict[str, list[Any]]
          "figures": {name: columns[name][k] for name in names}}
         for k, one in enumerate(status)
     ]  # fmt: skip
-    units = {name: found[name].attrs.get("units", "") for name in columns}
-    return rows, {f"{name} [{units[name]}]" if units[name] else name: x for name, x in columns.items()} | {
-        "status": status
-    }
+    heads = {name: f"{name} [{unit}]" if (unit := found[name].attrs.get("units")) else name for name in columns}
+    return rows, {heads[name]: x for name, x in columns.items()} | {"status": status}
 
 
 def _refuse_twice(*names: str) -> None:
@@ -286,10 +285,6 @@ def _found(
     coords = {axis: (axis, t, data.pop(axis)[2])} if axis else {}
     about = {"failures": [failures[k] for k in sorted(failures)[:MESSAGES]]}
     return _dataset(circuit, steps, data, coords, about)
-
-
-def _unit(name: str) -> dict[str, str]:
-    return {"units": signal_of(name).unit}
 
 
 def _dataset(
