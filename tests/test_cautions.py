@@ -132,8 +132,19 @@ def test_the_error_of_skin_data_at_one_frequency_follows_the_circuit_not_the_one
 
 
 def test_directives_without_effect_are_warned_about_but_not_those_for_ngspice() -> None:
-    (text,) = of(table1(extra=".plot tran v(top)\n.nodeset v(area)=35\n.options reltol=1e-4"))
+    (text,) = of(table1(extra=".plot tran v(top)\n.nodeset v(area)=35"))
     assert text == ".plot has no effect here"
+
+
+def test_options_without_effect_are_told_by_results_and_files_and_not_warned_of(tmp_path: Path) -> None:
+    circuit = table1(extra=".options reltol=1e-4 work=gap\n.option plotwinsize=0\n.plot tran v(top)")
+    told = ".options reltol, plotwinsize: of no effect here, where rtol alone sets the error"
+    with pytest.warns(fs.FingerspiceWarning) as caught:
+        run, state = fs.simulate(circuit, t_stop=1e-3, rtol=1e-6), fs.steady_state(circuit, rtol=1e-6).solution
+    assert {str(w.message) for w in caught} == {".plot has no effect here"}
+    loaded = fs.load(run.to_netcdf(tmp_path / "run.nc"))
+    for one in (run, state, loaded):
+        assert one.warnings == (told, ".plot has no effect here")
 
 
 def test_a_source_that_is_not_named_stays_on_and_is_warned_about() -> None:

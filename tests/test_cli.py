@@ -156,9 +156,13 @@ def test_what_the_reader_notices_is_printed_once_with_its_line(command: Command)
     Path("pad.cir").write_text(edited(QUICK, ("r=1meg", "r=1MOhm"), (".end", lines)))
     result = command("ac", "pad.cir", "--no-plot", "--sweep", "lin 2 100 200")
     first, second = (line for line in result.lines if "note" not in line)
-    assert "note: .options reltol, trtol: of no effect here, where --rtol alone sets the error" in result.err
+    assert "note: .options reltol, trtol: of no effect here, where rtol alone sets the error" in result.err
     assert first.startswith("fingerspice: warning: pad.cir:5:41: Xgap r: '1MOhm' is milli (0.001 ohm)")
     assert second == "fingerspice: warning: .plot has no effect here"
+    for words in (["run"], ["run", "--stream", "--stop", "50m"], ["plan"]):
+        again = command(*words, "pad.cir", "--json", *(["--no-plot"] if words != ["plan"] else []))
+        assert again.err.count("of no effect here") == 1, words
+        assert json.loads(again.out)["warnings"].count(result.err.partition("note: ")[2].partition("\n")[0]) == 1
 
 
 def test_values_on_the_command_line_have_the_traps_of_the_deck(command: Command) -> None:

@@ -67,6 +67,28 @@ def test_save_chooses_the_columns_of_tables_and_raw_files(tmp_path: Path) -> Non
     np.testing.assert_array_equal(raw.vectors["'v(top)*2'"], 2.0 * run.node_voltages["top"])
 
 
+def test_json_has_figures_of_what_is_saved_and_a_loaded_run_has_tables(
+    tmp_path: Path, command: Callable[..., Any]
+) -> None:
+    """Over whole periods of a sine: its amplitude, its mean of 0, and its amplitude over the root of 2."""
+    body = "V1 a 0 SIN(0.5 2 1k)\nR1 a b 1k\nR2 b 0 1k\nXgap a 0 area GAP a_fix=35\n.tran 10u 5m uic\n"
+    save = ".save V(b) I(R1) V(area)\n.probe {2*V(a,b)} @Xgap[a_real]\n"
+    (tmp_path / "saved.cir").write_text(f"saved\n{body}{save}.end\n")
+    words = "run", str(tmp_path / "saved.cir"), "--no-plot", "--out", str(tmp_path), "--json"
+    rows = json.loads(command(*words).out)["saved"]
+    units = {"V(b)": "V", "I(R1)": "A", "V(area)": "mm^2", "{2*V(a,b)}": "1", "@Xgap[a_real]": "m^2"}
+    assert {row["vector"]: row["unit"] for row in rows} == units
+    for row, scale in zip(rows, (1.0, 1e-3, None, 2.0), strict=False):
+        expected = [scale * x for x in (-0.75, 1.25, 0.25, np.hypot(0.25, np.sqrt(0.5)))] if scale else [35.0] * 4
+        assert [row[key] for key in ("min", "max", "mean", "rms")] == pytest.approx(expected, rel=1e-7), row
+    # Without a p_sat there is no real area.
+    assert rows[-1]["max"] is None
+    table = fs.load(tmp_path / "saved.nc").to_csv(tmp_path / "again.csv").read_text()
+    assert table.startswith("t [s],u_source [V],")
+    (tmp_path / "plain.cir").write_text(f"plain\n{body}.end\n")
+    assert json.loads(command(*words[:1], str(tmp_path / "plain.cir"), *words[2:]).out)["saved"] == []
+
+
 def test_ngspices_files_are_read_binary_and_ascii_and_compared(tmp_path: Path, command: Callable[..., Any]) -> None:
     circuit = table1(tran="10u 20m 0 1u uic")
     (tmp_path / "deck.cir").write_text(fs.export_netlist(circuit))

@@ -136,7 +136,7 @@ def test_a_source_and_the_end_of_a_run_are_stepped() -> None:
     bad = fs.run_steps(
         fs.parse_netlist(DECK.format(lines=".step param h list 1m 2m", tstep="{h}").replace("V=200", "V=200 h=1u"))
     )
-    assert "other times" in bad.attrs["failures"][0]
+    assert "differ in time" in bad.attrs["failures"][0]
 
 
 def test_refused_requests() -> None:
@@ -209,10 +209,16 @@ def test_run_writes_steps_and_analyses(command: Command) -> None:
     assert "gap = -1e-06" in done.err
     assert len(answer["dc"]) == 15
     assert answer["op"] is None
-    assert ".ac beside .step is done with the deck's own values" in done.err
-    assert len(answer["sweeps"][0]["frequency"]) == 16
+    assert [one["status"] for one in answer["sweeps"]] == ["one_by_one", "refused", "one_by_one"]
+    swept = fs.phasor(deck().replace({"Xgap.d": 4e-6, "Xgap.r": 8e6 / 7.0}), answer["sweeps"][2]["frequency"])
+    assert answer["sweeps"][2]["u_gap"] == pytest.approx(np.abs(swept.u_gap).tolist(), rel=1e-12)
+    assert answer["sweeps"][1]["u_gap"] == [None] * 16
+    assert len([text for text in answer["warnings"] if text.startswith("gap = -1e-06: ")]) == 1
     names = sorted(path.name for path in Path("out").iterdir() if path.name[0] != ".")
-    assert names == ["steps.nc", "steps.png", "steps_ac.csv", "steps_ac.png", "steps_dc.csv", "steps_dc.png"]
+    others = [f"steps_{kind}" for kind in ("ac.csv", "ac.nc", "ac.png", "dc.csv", "dc.png")]
+    assert names == ["steps.nc", "steps.png", *others]
+    with xarray.open_dataset("out/steps_ac.nc", engine="h5netcdf") as kept:
+        assert kept.f_el_mean.dims == ("gap", "frequency")
     with xarray.open_dataset("out/steps.nc", engine="h5netcdf") as kept:
         assert math.isnan(kept.most[1])
         assert kept.u_gap.dims == ("gap", "time")
@@ -232,6 +238,47 @@ def test_run_writes_steps_and_analyses(command: Command) -> None:
     assert refused.code == 2
     assert "--feel goes with one run" in refused.err
     assert ".step has no effect in one run" in command("plan", "steps.cir").err
+
+
+LOW_PASS = """low pass of a stepped resistance
+.param r=1k n=2
+V1 in 0 AC 1
+R1 in out {r}
+C1 out 0 1u
+.ac dec {n} 10 1k
+.step param r list 1k 4k
+.step C1 1u 2u 1u
+.meas ac corner WHEN VM(out)=0.5 FALL=1
+.end
+"""
+
+
+def test_a_sweep_at_each_step_equals_its_closed_form(command: Command) -> None:
+    """Of a low pass, with the frequency at which half of the voltage is left."""
+    found = fs.phasor_steps(fs.parse_netlist(LOW_PASS))
+    assert (found.sizes, found.frequency.attrs) == ({"r": 2, "C1.value": 2, "frequency": 5}, {"units": "Hz"})
+    r, c, f = np.ix_([1e3, 4e3], [1e-6, 2e-6], 10.0 ** np.arange(1.0, 3.1, 0.5))
+    expected = 1.0 / (1.0 + 2j * math.pi * f * r * c)
+    np.testing.assert_allclose(found["v:out"], np.abs(expected), rtol=1e-12)
+    np.testing.assert_allclose(found["phase_deg:out"], np.degrees(np.angle(expected)), rtol=1e-12)
+    np.testing.assert_allclose(found.corner, (math.sqrt(3.0) / (2.0 * math.pi * r * c))[..., 0], rtol=1e-9)
+    Path("low.cir").write_text(LOW_PASS)
+    done = command("run", "low.cir", "--json")
+    row = json.loads(done.out)["sweeps"][3]
+    assert row["values"] == {"r": 4e3, "C1.value": 2e-6}
+    assert row["figures"] == {"corner": pytest.approx(math.sqrt(3.0) / (2.0 * math.pi * 8e-3), rel=1e-9)}
+    assert row["v:out"] == pytest.approx(np.abs(expected[1, 1]).tolist(), rel=1e-12)
+    head, *rows = Path("out/low_ac.csv").read_text().splitlines()
+    assert head.startswith("r,C1.value [F],frequency [Hz],v:in [V],")
+    assert (len(rows), rows[19].split(",")[:3]) == (20, ["4000.0", "2e-06", "1000.0"])
+    assert "corner" in command("run", "low.cir").out
+    for lack, line in ((".ac", ".ac dec {n} 10 1k"), (".step", ".step param r list 1k 4k\n.step C1 1u 2u 1u")):
+        with pytest.raises(fs.InputError, match=rf"no \{lack} line; allowed: both"):
+            fs.phasor_steps(fs.parse_netlist(LOW_PASS.replace(line, "")))
+    with pytest.raises(fs.InputError, match="impedance is the name of a step or measure"):
+        fs.phasor_steps(fs.parse_netlist(LOW_PASS.replace("corner", "impedance")))
+    grown = fs.phasor_steps(fs.parse_netlist(LOW_PASS.replace("r list 1k 4k", "n list 1 2")))
+    assert "differ in frequency; allowed: a TSTEP, TSTART and .ac that stay" in grown.attrs["failures"][0]
 
 
 def test_a_deck_without_tran(command: Command) -> None:

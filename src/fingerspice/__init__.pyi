@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from fingerspice.studies.steady import phasor as phasor
     from fingerspice.studies.steady import steady_state as steady_state
     from fingerspice.studies.steps import operating_points as operating_points
+    from fingerspice.studies.steps import phasor_steps as phasor_steps
     from fingerspice.studies.steps import run_steps as run_steps
     from fingerspice.studies.sweep import sobol as sobol
     from fingerspice.studies.sweep import sweep as sweep

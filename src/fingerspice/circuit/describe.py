@@ -290,6 +290,12 @@ def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
     return (*(f"{name} has no effect here" for name in circuit.unused if not name.startswith(".options")), *stepped)
 
 
+def option_notes(circuit: Circuit) -> tuple[str, ...]:
+    """What a result says of the deck's options without effect, of which nobody is warned: decks have them by habit."""
+    names = ", ".join(name.removeprefix(".options ") for name in circuit.unused if name.startswith(".options "))
+    return (f".options {names}: of no effect here, where rtol alone sets the error",) if names else ()
+
+
 def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) -> Iterator[str]:
     """Warnings about sources that miss the run from `start` to `stop` (s), fill little of it, or are cut off by it.
 

@@ -99,13 +99,14 @@ def run(
     circuit, start = with_times(job.read(), job.stop, start)
     ends = studies.ends_beside(circuit)
     if circuit.tran is None and (circuit.op or ends):
-        studies.without_run(job, circuit, ends)
+        job.check_files(circuit, *ends)
+        said, others = studies.beside_run(job, circuit)
+        job.give(lambda: "\n\n".join([circuit.title, *said]), others)
         return
     if circuit.tran is None:
         raise InputError(f"{job.deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
-    how: dict[str, Any] = {"start": start, "rtol": job.rtol, "method": method}
     check_arguments(job.rtol, method, start, jumps)
-    how["area"] = area_given(area_from_text(area))
+    how: dict[str, Any] = {"start": start, "rtol": job.rtol, "method": method, "area": area_given(area_from_text(area))}
     how |= {"charge_law": job.charge_law, "t_stop": None if job.stop is None else circuit.tran.stop}
     if stream or chunk or signals or netcdf:
         from fingerspice.cli.store import run_streamed
@@ -120,7 +121,7 @@ def run(
                feel=feel, schematic=schematic)  # fmt: skip
         studies.stepped(job, circuit, how, [".csv" if csv else ".nc", ".png", *([".raw"] if raw else []), *ends])
         return
-    fingers: list[fs.Feel] = []
+    fingers, unfelt = list[fs.Feel](), None
     refuse(feel and not circuit.by_device("GAP"), "--feel: the circuit has no GAP, so there is no friction to feel")
     more = [end for end, on in (("_schematic.svg", schematic), ("_feel.png", feel), (".raw", raw)) if on]
     job.check_files(circuit, ".csv" if csv else ".nc", ".png", *more, *ends)
@@ -129,7 +130,6 @@ def run(
         solution = simulate(circuit, **how, jumps=jumps, throw=False, progress=update)
     if job.json:
         job.answer.update(**terminal.of_run(solution))
-    unfelt = None
     if feel and solution.success:
         try:
             fingers += [fs.feel(solution, name) for name in solution.record.names("f_t")]

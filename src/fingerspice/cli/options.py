@@ -106,7 +106,7 @@ class Job:
         the reader's warnings, without those about replaced values, and those about directives.
         """
         from fingerspice.circuit.circuit import CHARGE_LAWS
-        from fingerspice.circuit.describe import directive_warnings
+        from fingerspice.circuit.describe import directive_warnings, option_notes
 
         with warnings.catch_warnings(record=True, action="always", category=FingerspiceWarning) as noticed:
             circuit = fs.read_netlist(self.deck)
@@ -129,9 +129,9 @@ class Job:
         steps = self.answer["command"] in ("run", "export")
         for text in directive_warnings(dataclasses.replace(circuit, steps=()) if steps else circuit):
             warnings.warn(text, FingerspiceWarning, stacklevel=2)
-        others = [name.removeprefix(".options ") for name in circuit.unused if name.startswith(".options ")]
-        if others:
-            complain(f"note: .options {', '.join(others)}: of no effect here, where --rtol alone sets the error")
+        for text in option_notes(circuit):
+            self.answer["warnings"].append(text)
+            complain(f"note: {text}")
         law = self.charge_law or circuit.charge_law or "local"
         require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
         known = {"title": circuit.title, "overrides": dict(circuit.overrides), "sets": list(circuit.sets)}

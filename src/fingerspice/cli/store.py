@@ -11,7 +11,6 @@ import json
 import os
 import shutil
 import time
-import warnings
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -22,12 +21,13 @@ import numpy as np
 import fingerspice as fs
 from fingerspice.base.announcing import paced
 from fingerspice.base.compiled import STAMP
-from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.errors import InputError
 from fingerspice.base.files import settle_on_disk, write_aside, write_durably
 from fingerspice.circuit.describe import digests
 from fingerspice.cli.options import Job, check_output, number
 from fingerspice.results import runfile
 from fingerspice.results.record import SIGNALS, variables
+from fingerspice.solve.runs import warn
 from fingerspice.solve.streaming import Stream, stream
 from fingerspice.waveforms.waveform import refuse
 
@@ -231,9 +231,8 @@ def _fill(run: Stream, store: Store, names: list[str], about: dict[str, str]) ->
     with ThreadPoolExecutor(1) as writer, paced("simulating", (first - start) / span) as show:
         writing: Future[None] = writer.submit(lambda: None)
         for number, solution in enumerate(run, store.done):
-            for text in solution.warnings:
-                # One that comes again is not told again.
-                warnings.warn(text, FingerspiceWarning, stacklevel=2)
+            # One that comes again is not told again.
+            warn(solution, 2)
             writing.result()
             writing = writer.submit(store.write, number, solution, names, about, run.mark())
             reached = solution.t_stop

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import tomllib
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,6 @@ from fingerspice.base.files import write_aside, write_csv
 from fingerspice.base.pages import Table
 from fingerspice.base.units import amount_text
 from fingerspice.cli.options import Job, Makes, number
-from fingerspice.cli.terminal import complain
 from fingerspice.waveforms.waveform import refuse, require
 
 #: Keys of a sweep's file, and the arguments of `batch` among them.
@@ -49,26 +49,35 @@ def stepped(job: Job, circuit: fs.Circuit, how: Mapping[str, Any], ends: Iterabl
     """The part of `run` for a deck with `.step`: a table, a data file, and a family of curves."""
     from fingerspice.plots.picture import plot_steps
     from fingerspice.results.rawfile import write_raw_steps
-    from fingerspice.studies.steps import table_of
 
     job.check_files(circuit, *ends)
     said, others = beside_run(job, circuit)
     with paced("simulating the steps") as update:
         found = fs.run_steps(circuit, progress=update, **how)
-    rows, columns = table_of(found)
+    rows, columns = _rows(found)
     job.answer.update(steps=rows)
-    for text in found.attrs["failures"]:
-        complain(f"warning: {text}")
-    # An empty list cannot be kept in a file.
-    known = {key: value for key, value in found.attrs.items() if value != []}
-    kept = found.drop_attrs(deep=False).assign_attrs({**known, "deck": circuit.text, **job.about})
     makes: Makes = {
-        ".csv": partial(_write_columns, columns),
-        ".nc": lambda file: write_aside(file, lambda aside: kept.to_netcdf(aside, engine="h5netcdf")),
+        ".csv": partial(_write_columns, columns), ".nc": partial(_write_netcdf, job, circuit, found),
         ".png": partial(plot_steps, found),
         ".raw": partial(write_raw_steps, found, [one.name for one in circuit.by_device("GAP")]), **others,
     }  # fmt: skip
     job.give(lambda: "\n\n".join([circuit.title, _first_rows(columns), *said]), makes)
+
+
+def _rows(found: Any) -> tuple[list[dict[str, Any]], dict[str, list[Any]]]:
+    """As `table_of`; steps without a result are warned of."""
+    from fingerspice.studies.steps import table_of
+
+    for text in found.attrs["failures"]:
+        warnings.warn(text, fs.FingerspiceWarning, stacklevel=2)
+    return table_of(found)
+
+
+def _write_netcdf(job: Job, circuit: fs.Circuit, found: Any, file: Path) -> Path:
+    # An empty list cannot be kept in a file.
+    known = {key: value for key, value in found.attrs.items() if value != []}
+    kept = found.drop_attrs(deep=False).assign_attrs({**known, "deck": circuit.text, **job.about})
+    return write_aside(file, lambda aside: kept.to_netcdf(aside, engine="h5netcdf"))
 
 
 def _write_columns(columns: Mapping[str, Any], file: Path) -> Path:
@@ -80,9 +89,8 @@ _FIRST = 40  # Most rows of a table of steps that are printed
 
 def _first_rows(columns: Mapping[str, Any]) -> str:
     """The first rows of columns of numbers and words, as a table."""
-    rows = [
-        *zip(*([x if isinstance(x, str) else f"{x:.6g}" for x in column] for column in columns.values()), strict=True)
-    ]
+    cells = ([x if isinstance(x, str) else f"{x:.6g}" for x in column] for column in columns.values())
+    rows = [*zip(*cells, strict=True)]
     more = [f"... {len(rows) - _FIRST:,} more rows"] if len(rows) > _FIRST else []
     return "\n".join([Table(tuple(columns), rows[:_FIRST], left=0).text(), *more])
 
@@ -90,21 +98,14 @@ def _first_rows(columns: Mapping[str, Any]) -> str:
 def ends_beside(circuit: fs.Circuit) -> list[str]:
     """Endings of the files of what a deck asks for beside its run."""
     kinds = {"dc": circuit.dc or (circuit.op and circuit.steps), "ac": circuit.ac}
-    return [f"_{kind}.{end}" for kind, on in kinds.items() if on for end in ("csv", "png")]
-
-
-def without_run(job: Job, circuit: fs.Circuit, ends: Iterable[str]) -> None:
-    """The part of `run` for a deck without `.tran`, which asks for other things."""
-    job.check_files(circuit, *ends)
-    said, makes = beside_run(job, circuit)
-    job.give(lambda: "\n\n".join([circuit.title, *said]), makes)
+    both = circuit.ac and circuit.steps
+    return [f"_{kind}.{end}" for kind, on in kinds.items() if on for end in ("csv", "png")] + ["_ac.nc"] * bool(both)
 
 
 def beside_run(job: Job, circuit: fs.Circuit) -> tuple[list[str], Makes]:
     """What a deck asks of `run` by `.op`, `.dc` and `.ac`: texts, and what writes its files by their endings."""
     from fingerspice.results.spectrum import phasor_csv
     from fingerspice.studies.steady import sweep_frequencies
-    from fingerspice.studies.steps import table_of
 
     texts, makes = list[str](), dict[str, Any]()
     if circuit.op and not circuit.steps:
@@ -117,19 +118,30 @@ def beside_run(job: Job, circuit: fs.Circuit) -> tuple[list[str], Makes]:
         from fingerspice.plots.picture import plot_steps
 
         swept = fs.operating_points(circuit, charge_law=job.charge_law)
-        rows, columns = table_of(swept)
+        rows, columns = _rows(swept)
         job.answer.update(dc=rows)
         makes["_dc.csv"] = partial(_write_columns, columns)
         makes["_dc.png"] = partial(plot_steps, swept)
-    if circuit.ac is not None:
+    if circuit.ac is not None and circuit.steps:
+        from fingerspice.plots.picture import plot_steps
+        from fingerspice.studies.steps import table_of
+
+        found = fs.phasor_steps(circuit)
+        rows, columns = _rows(found)
+        wide, n = table_of(found.broadcast_like(found))[1], found.sizes["frequency"]
+        lists = {head.partition(" [")[0]: x for head, x in wide.items() if head not in columns}
+        sweeps = [row | {name: x[k * n : (k + 1) * n] for name, x in lists.items()} for k, row in enumerate(rows)]
+        job.answer.update(sweeps=sweeps)
+        makes |= {"_ac.csv": partial(_write_columns, wide), "_ac.png": partial(plot_steps, found),
+                  "_ac.nc": partial(_write_netcdf, job, circuit, found)}  # fmt: skip
+        texts.append(_first_rows(columns if len(columns) > found.status.ndim + 1 else wide))
+    elif circuit.ac is not None:
         from fingerspice.plots.traces import plot_phasor
 
-        if circuit.steps:
-            complain("note: .ac beside .step is done with the deck's own values")
-        sweeps = (fs.phasor(circuit, sweep_frequencies(circuit.ac)),)
-        job.answer.update(sweeps=[one.to_dict() for one in sweeps] if job.json else None)
-        makes |= {"_ac.csv": partial(phasor_csv, sweeps), "_ac.png": partial(plot_phasor, sweeps, circuit)}
-        texts.append(str(sweeps[0]._page(12)))
+        one = fs.phasor(circuit, sweep_frequencies(circuit.ac))
+        job.answer.update(sweeps=[one.to_dict()] if job.json else None)
+        makes |= {"_ac.csv": partial(phasor_csv, (one,)), "_ac.png": partial(plot_phasor, (one,), circuit)}
+        texts.append(str(one._page(12)))
     return texts, makes
 
 

@@ -24,8 +24,8 @@ COMMON = (
 OWN = {
     command: tuple(keys.split())
     for command, keys in {
-        "run": "area tier t_stop figures_from error fundamental fold_margin_min signals measures fourier feel stream "
-        "steps op dc sweeps",
+        "run": "area tier t_stop figures_from error fundamental fold_margin_min signals saved measures fourier feel "
+        "stream steps op dc sweeps",
         "ac": "area skin sweeps",
         "plan": "area tier reasons start rates stiff sensitivity error_bound plan_area",
         "compare": "frequency gaps phasor transient_mean_area transient_coupled vectors times",
@@ -55,6 +55,7 @@ def blank(command: str | None, given: Mapping[str, Any] = MappingProxyType({})) 
 
 def of_run(solution: fs.Solution) -> dict[str, Any]:
     """The part of an answer that describes a run: its method and error, and figures of every signal in SI units."""
+    from fingerspice.results.measures import saved_figures
     from fingerspice.results.record import SIGNALS
 
     s, rows = solution.summary(), []
@@ -67,6 +68,7 @@ def of_run(solution: fs.Solution) -> dict[str, Any]:
     return {
         "charge_law": solution.charge_law, "method": solution.method, "area": solution.area_mode,
         "tier": solution.plan.tier, "error": vars(solution.error), "signals": rows, "t_stop": s["t_stop"],
+        "saved": saved_figures(solution),
         "fourier": [one.plain() for one in solution.fourier.values() if not isinstance(one, str)],
         "measures": [{"name": name, **one._asdict()} for name, one in solution.measured.items()],
         **{key: s.get(key) for key in ("figures_from", "fundamental", "fold_margin_min")},

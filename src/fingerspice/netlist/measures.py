@@ -68,10 +68,6 @@ class _Line:
         self.at += bool(found)
         return found
 
-    def equals(self) -> None:
-        """Pass a sign =, if it is the next."""
-        self.at += self.peek() == "="
-
     def number(self, what: str) -> float:
         """A number, a parameter or an expression of these."""
         place = self.where
@@ -170,7 +166,7 @@ class _Line:
         found: dict[str, float] = {}
         while (key := self.peek()) in allowed:
             self.at += 1
-            self.equals()
+            self.word("=")
             last = key in EDGES and self.peek() == "last"
             self.at += last
             found[key] = LAST if last else self.number(f"the value of {key.upper()}")
@@ -181,8 +177,7 @@ class _Line:
         if self.peek() == "at":
             return Crossing(None, self.pairs(("at",))["at"])
         before, of, value = self.pairs(("val", "td", *EDGES)), self.quantity(), math.nan
-        if self.peek() == "=":
-            self.at += 1
+        if self.word("="):
             if self.words[self.at : self.at + 1] and self.words[self.at][0] == "vector":
                 of, value = of.less(self.quantity()), 0.0
             else:
@@ -222,7 +217,7 @@ def read_measure(
     of = start_at = stop_at = formula = None
     needs: tuple[str, ...] = ()
     if kind == "param":
-        words.equals()
+        words.word("=")
         place = words.where
         text = line.text[words.words[words.at][2] :] if words.at < len(words.words) else ""
         text, words.at = text.strip().strip("\"'{}").strip(), len(words.words)
@@ -239,8 +234,7 @@ def read_measure(
     else:
         of = words.quantity()
         if kind in ("find", "deriv"):
-            if words.peek() == "when":
-                words.at += 1
+            words.word("when")
             start_at = words.crossing()
     window = words.pairs(("from", "to", "td"))
     if words.at < len(words.words):
@@ -262,8 +256,8 @@ def read_fourier(
     words = _Line(line, start, params, elements, ".four")
     frequency = words.number("the fundamental")
     refuse(not frequency > 0.0, f".four has a fundamental of {frequency:g} Hz; allowed: more than 0", line.where(start))
-    found = [(frequency, words.quantity())]
-    while words.at < len(words.words):
+    found = list[tuple[float, Quantity]]()
+    while words.at < len(words.words) or not found:
         found.append((frequency, words.quantity()))
     return found
 
@@ -351,8 +345,8 @@ def _spaced(words: _Line, scale: str = "") -> list[float]:
     """Values from the next three numbers: first, last, and the increment or the points of a decade or octave."""
     place = words.where
     first, last, step = (words.number(what) for what in ("the first value", "the last value", "the increment"))
-    if scale in ("dec", "oct"):
-        base = 10.0 if scale == "dec" else 2.0
+    base = {"dec": 10.0, "oct": 2.0}.get(scale)
+    if base:
         good = first > 0.0 and last > 0.0 and step >= 1.0
         refuse(not good, f"{words.name} {scale} from {first:g} to {last:g} with {step:g} points; "
                "allowed: values above 0, and 1 or more points", place)  # fmt: skip
@@ -363,10 +357,7 @@ def _spaced(words: _Line, scale: str = "") -> list[float]:
         count = (last - first) / step
     refuse(count >= _MOST_STEPS, f"{words.name} has {count:.3g} values; allowed: {_MOST_STEPS:,}", place)
     number = range(math.floor(count * (1.0 + 1e-9) + 1e-9) + 1)
-    if scale in ("dec", "oct"):
-        values = [first * base ** math.copysign(k / step, last - first) for k in number]
-    else:
-        values = [first + k * step for k in number]
+    values = (first * base ** math.copysign(k / step, last - first) if base else first + k * step for k in number)
     return [float(f"{x:.14g}") for x in values]
 
 

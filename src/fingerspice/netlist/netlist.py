@@ -116,13 +116,9 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     refuse(len(laws) > 1, "both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
     law, said, effectless = next(iter(laws), None), tuple(notes), (*deck.unused, *unused, *unused_starts)
     read = deck.title, elements, tran, ac, initial, law, work, said, effectless, deck.text, deck.path
-    stepped: dict[str, Any] = {
-        "saved": tuple(saved),
-        "steps": checked_steps(steps, ".step"),
-        "dc": checked_steps(dc, ".dc"),
-    }
-    stepped["op"] = any(name == ".op" for name, _, _ in deck.asked)
-    return checked(Circuit(*read, measures=tuple(measures), fourier=tuple(fourier), **stepped))
+    wanted: dict[str, Any] = {"measures": tuple(measures), "fourier": tuple(fourier), "saved": tuple(saved)}
+    stepped, op = checked_steps(steps, ".step"), any(name == ".op" for name, _, _ in deck.asked)
+    return checked(Circuit(*read, **wanted, steps=stepped, dc=checked_steps(dc, ".dc"), op=op))
 
 
 def at_parameters(circuit: Circuit, values: Mapping[str, float]) -> Circuit:
@@ -149,7 +145,7 @@ def at_parameters(circuit: Circuit, values: Mapping[str, float]) -> Circuit:
             name: getattr(own, name) for name in ("waveform", "ac", "law") if getattr(own, name) != getattr(was, name)
         }
         elements.append(own if was == now else replace(now, **kept))
-    same = {name: getattr(new, name) for name in ("tran", "initial", "measures", "fourier")
+    same = {name: getattr(new, name) for name in ("tran", "ac", "initial", "measures", "fourier")
             if getattr(circuit, name) == getattr(old, name)}  # fmt: skip
     changed = circuit._with(elements=tuple(elements), **same)
     check(changed)

@@ -206,15 +206,15 @@ _MOST_LINES, _MOST_PANELS, _MOST_MARKS = 60, 4, 12  # Of a picture of steps; mar
 
 
 def plot_steps(found: Dataset) -> Picture:
-    """Signals of `run_steps` over time, or of `operating_points` over what is swept first, coloured by a step.
+    """Signals of `run_steps` over time, of `phasor_steps` over frequency, or of `operating_points` over what is first.
 
-    A second step makes dashes, as far as there are dashes.
+    A step makes the colour, a second one dashes, as far as there are dashes.
     """
-    over_time = "time" in found.dims
-    names = [str(name) for name, one in found.data_vars.items() if not over_time or "time" in one.dims]
+    axis = next((str(dim) for dim in found.dims if dim not in found["status"].dims), "")
+    names = [str(name) for name, one in found.data_vars.items() if not axis or axis in one.dims]
     wanted = ("u_gap", "f_el", "f_t", "area") if any(name.startswith("u_gap") for name in names) else ("v",)
-    names = [name for key in wanted for name in names if name.partition(":")[0] == key][:_MOST_PANELS]
-    x, *steps = [*(["time"] if over_time else []), *(str(dim) for dim in found.dims if dim != "time")]
+    names = [x for key in wanted for x in names if x.partition(":")[0].removesuffix("_mean") == key][:_MOST_PANELS]
+    x, *steps = [*([axis] if axis else []), *(str(dim) for dim in found.dims if dim != axis)]
     figure, axes = drawing.new_figure(len(names), height=1.0 + 1.4 * len(names), sharex=True)
     colour, *dashed = steps or [""]
     scale = found[colour].values if colour else np.zeros(1)
@@ -224,12 +224,12 @@ def plot_steps(found: Dataset) -> Picture:
     wave = found.stack(line=steps) if steps else found.expand_dims("line")
     lines = np.unique(np.linspace(0, wave.line.size - 1, _MOST_LINES).astype(int))
     at = found[x].values
-    factor_x, unit_x = drawing.engineering(
-        drawing.peak_of(at), found[x].attrs.get("units", ""), 2.0 if over_time else 1.0
-    )
+    # A logarithmic axis needs no prefix.
+    largest, unit_x = 1.0 if axis == "frequency" else drawing.peak_of(at), found[x].attrs.get("units", "")
+    factor_x, unit_x = drawing.engineering(largest, unit_x, 2.0 if axis == "time" else 1.0)
     for ax, name in zip(axes, names, strict=True):
         values = wave[name].transpose("line", x).values
-        signal = signal_of(name)
+        signal = signal_of(name.removesuffix("_mean"))
         factor, unit = drawing.engineering(drawing.peak_of(np.nan_to_num(values)), signal.unit, signal.least)
         for k in lines:
             place = wave[colour].values[k] if colour else 0.0
@@ -239,7 +239,9 @@ def plot_steps(found: Dataset) -> Picture:
         gap = f" {name.partition(':')[2]}" if ":" in name else ""
         drawing.dress(ax, f"{signal.axis}{gap} [{unit}]")
         drawing.flat(ax, factor * values[np.isfinite(values)])
-    drawing.dress(axes[-1], xlabel=f"{'Time' if over_time else x} [{unit_x}]" if unit_x else x)
+    drawing.dress(axes[-1], xlabel=f"{axis.capitalize() or x} [{unit_x}]" if unit_x else x)
+    if axis == "frequency":
+        axes[-1].set_xscale("log")
     if colour:
         unit = found[colour].attrs.get("units", "")
         shown = EngFormatter(unit.replace("1", "")) if "^" not in unit else None

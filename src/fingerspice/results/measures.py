@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fingerspice.results.spectrum import PhasorSolution
 
 _MOST_PIECES, _MOST_HALVINGS = 60, 12  # Of a sweep, with as many polynomials, before pieces are halved
+_FIGURES = {"min": "min", "max": "max", "mean": "avg", "rms": "rms"}  # Of saved vectors, with the form of a measure
 _TOLERANCE = 1e-12  # Of the polynomials in which crossings are looked for, relative to the peak
 
 
@@ -94,16 +95,29 @@ def saved_columns(solution: Solution) -> dict[str, tuple[FloatArray, str]]:
         return {name: (x, unit) for name, (x, unit, _) in solution.signals.items()}
     found = {}
     for one in solution.circuit.saved:
-        kind = one.vectors[0].kind if one.function is None else ""
-        unit = {"": "1", "i": "A", "v": "V", "u_layer": "V"}.get(kind) or signal_of(kind).unit
-        # An area node has mm^2, as it is in SPICE.
-        areas = areas_of(solution.record, solution.circuit)
-        unit = "mm^2" if kind == "v" and set(one.vectors[0].names) <= areas.keys() else unit
         try:
-            found[one.text] = values_of(solution, one)(solution.record), unit
+            values = values_of(solution, one)(solution.record)
         except Failed:
-            found[one.text] = np.full(solution.t.size, math.nan), unit
+            values = np.full(solution.t.size, math.nan)
+        found[one.text] = values, _unit(solution, one)
     return found
+
+
+def saved_figures(solution: Solution) -> list[dict[str, Any]]:
+    """Unit and figures over the run of each vector that the deck's `.save` lines name; NaN where it has none."""
+    return [
+        {"vector": one.text, "unit": _unit(solution, one)}
+        | {key: x.value for key, x in measured(solution, [Measure(k, f, one) for k, f in _FIGURES.items()]).items()}
+        for one in solution.circuit.saved
+    ]
+
+
+def _unit(solution: Solution, quantity: Quantity) -> str:
+    kind, names = quantity.vectors[0] if quantity.function is None else ("", ())
+    # An area node has mm^2, as it is in SPICE.
+    if kind == "v" and set(names) <= areas_of(solution.record, solution.circuit).keys():
+        return "mm^2"
+    return {"": "1", "i": "A"}.get(kind) or signal_of(kind).unit
 
 
 def _of_inductor(circuit: Circuit, element: Element) -> Callable[[Signals], FloatArray]:
@@ -181,9 +195,8 @@ class _Course:
 
     def weighed(self, longest: float = math.inf) -> Weighed:
         """Values with weights for means, on pieces of at most `longest` (s)."""
-        return (
-            self.span.weigh(self.values, longest) if isinstance(self.span, Stretch) else weigh_outputs(self.t, self.x)
-        )
+        span = self.span
+        return span.weigh(self.values, longest) if isinstance(span, Stretch) else weigh_outputs(self.t, self.x)
 
     def extreme(self, sign: float) -> tuple[float, float]:
         """Time (s) and value of the largest value, or with the sign -1 of the smallest."""
@@ -272,9 +285,8 @@ def _part(found: PhasorSolution, vector: Vector) -> FloatArray:
     if vector.kind == "u_gap":
         return np.abs(found.u_gap)
     if vector.kind not in ("area", "f_el"):
-        raise Failed(
-            f"{vector.kind} of {', '.join(vector.names)} is no part of a sweep; allowed: V, VM, VDB, VP, VR, VI"
-        )
+        of = f"{vector.kind} of {', '.join(vector.names)}"
+        raise Failed(f"{of} is no part of a sweep; allowed: V, VM, VDB, VP, VR, VI")
     return found.area if vector.kind == "area" else found.f_el_mean
 
 
@@ -370,11 +382,12 @@ def _made(solution: Solution | Sweep, one: Measure, known: Mapping[str, float]) 
     }[one.kind]  # fmt: skip
 
 
-def measured(solution: Solution | Sweep) -> dict[str, Measured]:
-    """The deck's measures of a run or of a sweep, by name."""
+def measured(solution: Solution | Sweep, asked: Sequence[Measure] | None = None) -> dict[str, Measured]:
+    """The deck's measures of a run or of a sweep, or those asked for, by name."""
     found: dict[str, Measured] = {}
     analysis, size = ("ac", solution.frequency.size) if isinstance(solution, Sweep) else ("tran", solution.t.size)
-    for one in [one for one in solution.circuit.measures if one.analysis == analysis]:
+    asked = solution.circuit.measures if asked is None else asked
+    for one in [one for one in asked if one.analysis == analysis]:
         try:
             if size < 2:
                 raise Failed("the run has no outputs")

@@ -202,13 +202,8 @@ _WAVEFORMS = {
     )
 }  # fmt: skip
 _OF_CONTACT = ("d", "eps_r", "f_n", "mu", "p_sat")  # What the signals of a run need of a contact
-_LEFT_OUT = (
-    "where",
-    "text",
-    "path",
-    "measures",
-    "fourier",
-)  # Attributes of circuits and elements that a file does not hold here
+# Attributes of circuits and elements that a file does not hold here.
+_LEFT_OUT = ("where", "text", "path", "measures", "fourier", "saved", "steps", "dc")
 
 
 def _failure(plain: dict[str, Any]) -> Failure:

@@ -180,6 +180,8 @@ class Solution(Remembering, Sealed, Shown, Signalled, Figured, Measuring):
     plan : Plan
         The model that was run, and the reasons for it.
     circuit, state : Circuit, State
+    warnings : tuple of str
+        Of the deck and of the run; and which options of the deck have no effect, of which Python gives no warning.
     first, t_stop : float
         TSTART and the end of the run, s.
     start : str

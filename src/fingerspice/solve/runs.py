@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -12,9 +13,9 @@ from typing import Literal
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
-from fingerspice.base.errors import InputError
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
-from fingerspice.circuit.describe import circuit_warnings, course_warnings, spectrum_warning
+from fingerspice.circuit.describe import circuit_warnings, course_warnings, option_notes, spectrum_warning
 from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.statespace import driving
 from fingerspice.engine.collocation.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
@@ -22,6 +23,7 @@ from fingerspice.engine.network import Sources, rates_at
 from fingerspice.physics.contact import LawContact, inverse_area
 from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, State, Status, last_tried
 from fingerspice.results.record import Record
+from fingerspice.results.solution import Solution
 from fingerspice.results.steps import ClosedForm, Recorded
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, shortest_event, values_at
 from fingerspice.waveforms.periodic import PWL
@@ -314,7 +316,8 @@ def refuse_beyond_law(problem: Problem, area: int, u: float, when: str = "") -> 
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Warnings for every limit of the model that the run exceeds."""
     success, several, net = run.status is Status.SUCCESS, len(record.fingers) > 1, problem.scene.net
-    yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
+    circuit = problem.circuit
+    yield from (*circuit.warnings, *option_notes(circuit), *circuit_warnings(circuit, problem.t_stop))
     key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
     yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
     waves = problem.network.waveforms
@@ -364,6 +367,13 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
             if field > strength:
                 met = f"the field in {layer.name} reaches {field:.3g} V/m at the outputs"
                 yield f"{met}; its dielectric strength is {strength:.3g} V/m"
+
+
+def warn(solution: Solution, level: int) -> None:
+    """Issue a run's warnings but for its circuit's own, issued when that was read, and notes of options."""
+    quiet = (*solution.circuit.warnings, *option_notes(solution.circuit))
+    for text in [text for text in solution.warnings if text not in quiet]:
+        warnings.warn(text, FingerspiceWarning, stacklevel=level + 1)
 
 
 def _source_warnings(problem: Problem) -> Iterator[str]:

@@ -30,7 +30,7 @@ from fingerspice.solve.nodal import FOREIGN, solve_coupled, solve_foreign
 from fingerspice.solve.periodic import asked
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare, shortest_event
 from fingerspice.solve.recordings import solve as solve_recording
-from fingerspice.solve.runs import ROUGH, Progress, Run, excess_of, run_failure, run_warnings
+from fingerspice.solve.runs import ROUGH, Progress, Run, excess_of, run_failure, run_warnings, warn
 from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.waveform import DOUBLE, refuse, require
 
@@ -138,10 +138,7 @@ def simulate(
         solution = dataclasses.replace(solution, sensitivities=sensitivities_of(problem, solution, sensitivities, run))
     if solution.failure is not None and throw:
         raise SolveError(solution.failure, solution)
-    for text in solution.warnings:
-        # Those of the circuit itself were issued when it was read.
-        if text not in solution.circuit.warnings:
-            warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    warn(solution, 2)
     return solution
 
 

@@ -31,7 +31,7 @@ from fingerspice.results.steps import weigh_outputs
 from fingerspice.solve.derivatives import check_request, sensitivities_of
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
-from fingerspice.solve.runs import Progress
+from fingerspice.solve.runs import Progress, warn
 from fingerspice.solve.simulation import rtol_given, run_problem
 from fingerspice.waveforms.waveform import Fundamental, Sine, refuse, require
 
@@ -287,10 +287,8 @@ class SteadyState(Shown, Figured):
         if self.asked:
             found = sensitivities_of(self.problem, solution, self.asked, self._run, over_period=True)
             solution = dataclasses.replace(solution, sensitivities=found)
-        for text in solution.warnings:
-            if text not in self.problem.circuit.warnings:
-                # The third level is the caller's line, beyond the frame of `cached_property`.
-                warnings.warn(text, FingerspiceWarning, stacklevel=3)
+        # The third level is the caller's line, beyond the frame of `cached_property`.
+        warn(solution, 3)
         return solution
 
 

@@ -33,6 +33,7 @@ from fingerspice.studies.batch.batch import (
     checked_scenes,
     processors,
 )
+from fingerspice.studies.steady import phasor, sweep_frequencies
 from fingerspice.waveforms.waveform import DC, refuse, require
 
 if TYPE_CHECKING:
@@ -88,12 +89,9 @@ def run_steps(
     signals = (_SIGNALS if fingers else _PLAIN) if signals is None else tuple(signals)
     for name in outputs:
         require(name in OUTPUTS and name != "u_gap", "outputs", repr(name), f"figures such as {', '.join(FIGURES)}")
-    measured, named = [one.name for one in circuit.measures], [one.name for one in circuit.steps]
-    twice = [
-        name for name, n in Counter((*measured, *named, *signals, *outputs, "time", "status", "error")).items() if n > 1
-    ]
-    refuse(twice, f"{', '.join(twice)} is the name of a step or measure, and of what is kept; allowed: another name")
-    figures_alone = not signals and not measured and not options.keys() - {"rtol", "t_stop"}
+    named = *(one.name for one in circuit.measures), *(one.name for one in circuit.steps)
+    _refuse_twice(*named, *signals, *outputs, "time", "status", "error")
+    figures_alone = not signals and not circuit.measures and not options.keys() - {"rtol", "t_stop"}
     if figures_alone and (table := _table(circuit)) is not None:
         found = batch(circuit, table, outputs=outputs, **options)
         data: dict[str, Any] = {str(name): (x.dims[1:], x.values, x.attrs) for name, x in found.data_vars.items()}
@@ -102,11 +100,12 @@ def run_steps(
     def kept(scene: Circuit) -> dict[str, Row]:
         run = simulate(scene, jumps="none", **options)
         names = [one for key in signals for one in run.record.names(key)]
-        row: dict[str, Row] = {name: (("time",), run.record.one(name), _unit(name)) for name in names}
-        row["time"] = ("time",), run.t, {}
+        units = {name: {"units": signal_of(name).unit} for name in (*names, *(OUTPUTS[name][0] for name in outputs))}
+        row: dict[str, Row] = {name: (("time",), run.record.one(name), units[name]) for name in names}
+        row["time"] = ("time",), run.t, {"units": "s"}
         for name in outputs:
             value = np.asarray(run._figure(*OUTPUTS[name]), float)
-            row[name] = ("gap",)[: value.ndim], value, _unit(OUTPUTS[name][0])
+            row[name] = ("gap",)[: value.ndim], value, units[OUTPUTS[name][0]]
         return row | {name: ((), np.array(value), {}) for name, value in run.measures.items()}
 
     tran = circuit.tran
@@ -114,6 +113,41 @@ def run_steps(
     size = math.prod(len(one.values) for one in circuit.steps) * times * len(signals)
     require(size <= _MOST_KEPT, ".step", f"{size:.3g} numbers of signals", f"{_MOST_KEPT:g}; fewer outputs or signals")
     return _found(circuit, circuit.steps, kept, progress)
+
+
+def phasor_steps(circuit: Circuit, **options: Any) -> Dataset:
+    """The `.ac` sweep of a circuit at all values of its deck's `.step` lines.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    **options
+        As of `phasor`: `area`, `skin` and `finger`.
+
+    Returns
+    -------
+    xarray.Dataset
+        With a dimension for each step and ``frequency`` (Hz); the columns of the sweep's table, as ``u_gap`` (V) and
+        ``phase_deg``, or without a GAP ``v:top`` (V) and ``phase_deg:top``; the deck's measures of `.ac` by their
+        names; and ``status`` and `failures` as in `run_steps`.
+
+    Raises
+    ------
+    InputError
+        For a deck without `.ac` or `.step`, and for a name that is given twice.
+    """
+    require_circuit(circuit)
+    lacks = "" if circuit.ac and circuit.steps else ".ac" if circuit.steps else ".step"
+    refuse(lacks, f"the deck has no {lacks} line; allowed: both, such as .ac dec 10 10 10k and .step Xgap.d 3u 4u 0.1u")
+
+    def swept(scene: Circuit) -> dict[str, Row]:
+        assert scene.ac is not None
+        found = phasor(scene, sweep_frequencies(scene.ac), **options)
+        row: dict[str, Row] = {x.key: (("frequency",), x.values, {"units": x.unit}) for x in found._columns()}
+        _refuse_twice(*row, *found.measures, *(one.name for one in scene.steps), "status")
+        return row | {name: ((), np.array(value), {}) for name, value in found.measures.items()}
+
+    return _found(circuit, circuit.steps, swept, None)
 
 
 def operating_points(circuit: Circuit, *, charge_law: str | None = None) -> Dataset:
@@ -153,9 +187,9 @@ def operating_points(circuit: Circuit, *, charge_law: str | None = None) -> Data
 
 
 def table_of(found: Dataset) -> tuple[list[dict[str, Any]], dict[str, list[Any]]]:
-    """The scenes of steps as plain data, and as columns with units in their heads; without what runs over time."""
-    steps = [str(name) for name in found.dims if name != "time"]
-    names = [str(name) for name, one in found.data_vars.items() if "time" not in one.dims and name != "status"]
+    """The scenes of steps as plain data, and as columns with units in heads; without what has a further dimension."""
+    steps = [str(name) for name in found["status"].dims]
+    names = [str(name) for name, one in found.data_vars.items() if one.ndim == len(steps) and name != "status"]
     mesh = np.meshgrid(*(found[name].values for name in steps), indexing="ij")
     columns = {name: x.ravel().tolist() for name, x in zip(steps, mesh, strict=True)}
     columns |= {name: found[name].values.ravel().tolist() for name in names}
@@ -165,10 +199,13 @@ def table_of(found: Dataset) -> tuple[list[dict[str, Any]], dict[str, list[Any]]
          "figures": {name: columns[name][k] for name in names}}
         for k, one in enumerate(status)
     ]  # fmt: skip
-    units = {name: found[name].attrs.get("units", "") for name in columns}
-    return rows, {f"{name} [{units[name]}]" if units[name] else name: x for name, x in columns.items()} | {
-        "status": status
-    }
+    heads = {name: f"{name} [{unit}]" if (unit := found[name].attrs.get("units")) else name for name in columns}
+    return rows, {heads[name]: x for name, x in columns.items()} | {"status": status}
+
+
+def _refuse_twice(*names: str) -> None:
+    twice = [name for name, n in Counter(names).items() if n > 1]
+    refuse(twice, f"{', '.join(twice)} is the name of a step or measure, and of what is kept; allowed: another name")
 
 
 def scene_of(circuit: Circuit, values: Mapping[Step, float]) -> Circuit:
@@ -229,28 +266,25 @@ def _found(
     with warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(processors()) as pool:
         list(pool.map(one, range(len(scenes))))
     refuse(len(failures) == len(rows), f"no step has a result; the first: {failures.get(0)}")
-    t = max((row["time"][1] for row in rows if "time" in row), key=np.size, default=np.empty(0))
+    axis = next((name for row in rows for name, one in row.items() if one[0] == (name,)), "")
+    t = max((row[axis][1] for row in rows if axis in row), key=np.size, default=np.empty(0))
     for k, row in enumerate(rows):
-        own = row["time"][1] if "time" in row else t[:0]
+        own = row[axis][1] if axis in row else t[:0]
         if not np.allclose(own, t[: own.size], rtol=1e-9, atol=0.0):
             rows[k], status[k] = {}, REFUSED
-            failures[k] = f"{told(k)}its outputs are at other times; allowed: a TSTEP and TSTART that stay"
+            failures[k] = f"{told(k)}its outputs differ in {axis}; allowed: a TSTEP, TSTART and .ac that stay"
     data: dict[str, Row] = {"status": ((), status, STATUS)}
     for name, (dims, first, attrs) in next(filter(None, rows)).items():
         # A run that ends earlier than others has no values after its end.
-        values = np.full((len(rows), *(t.shape if dims == ("time",) else first.shape)), np.nan)
+        values = np.full((len(rows), *(t.shape if dims == (axis,) else first.shape)), np.nan)
         for k, row in enumerate(rows):
             if row:
                 value = row[name][1]
-                values[(k, slice(value.size)) if dims == ("time",) else k] = value
+                values[(k, slice(value.size)) if dims == (axis,) else k] = value
         data[name] = dims, values, attrs
-    data.pop("time", None)
+    coords = {axis: (axis, t, data.pop(axis)[2])} if axis else {}
     about = {"failures": [failures[k] for k in sorted(failures)[:MESSAGES]]}
-    return _dataset(circuit, steps, data, {"time": ("time", t, {"units": "s"})} if t.size else {}, about)
-
-
-def _unit(name: str) -> dict[str, str]:
-    return {"units": signal_of(name).unit}
+    return _dataset(circuit, steps, data, coords, about)
 
 
 def _dataset(
