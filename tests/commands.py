@@ -1,9 +1,11 @@
 """Runs `fingerspice ARGUMENTS` in this process, for the tests of the command line."""
 
+import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,6 +27,22 @@ class Result:
     def lines(self) -> list[str]:
         """Lines on stderr, without those about compilation, which depend on the tests before."""
         return [line for line in self.err.splitlines() if ": note: compiling" not in line]
+
+    @property
+    def json(self) -> Any:
+        """What a command with `--json` has printed."""
+        return json.loads(self.out)
+
+    def ok(self) -> "Result":
+        """Itself, of a command that succeeded."""
+        assert self.code == 0, self.err
+        return self
+
+    def refused(self, *said: str) -> "Result":
+        """Itself, of a command whose request was refused with all these words on stderr."""
+        assert self.code == 2, self.err
+        assert [words for words in said if words not in self.err] == []
+        return self
 
 
 Command = Callable[..., Result]

@@ -26,6 +26,19 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 
 
 @pytest.fixture(scope="module")
+def circuit() -> fs.Circuit:
+    """Table 1's deck as it is shipped."""
+    return shipped("fingerpad")
+
+
+@pytest.fixture(scope="module")
+def explorer() -> Iterator[fs.Explorer]:
+    running = fs.explore(browser=False)
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
 def forked_workers() -> Iterator[None]:
     """Workers are forks of one process that has imported what they need; others start as a user's do."""
     utils = pytest.importorskip("distributed.utils")

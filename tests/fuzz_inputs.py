@@ -5,6 +5,8 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from scenes import listed
+
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 
 # Tables by subject, not one entry a line.
@@ -43,31 +45,7 @@ FILES = (
     *("pipe.lib", "x" * 300, "a/" * 200, "file:///etc/passwd", "http://a.example/b", "part.lib/../part.lib",
       "deck.cir"),
 )
-#: `{n}` is a number, `{w}` a name, `{f}` a file, `{s}` a source, `{x}` arithmetic.
-LINES = (
-    *(".include {f}", ".lib {f}", ".inc {f}", ".lib {f} {w}", ".param {w}={x}", ".param {w}={{{x}}} {w}={n}",
-      ".param {w}='{x}'"),
-    *("R{w} {w} {w} {n}", "C{w} {w} {w} {n} ic={n}", "V{w} {w} {w} {s}", "I{w} {w} 0 {s}",
-      "R{w} {w} {w} {{{x}}}", "Rz 0 0 {x}"),
-    *("X{w} {w} {w} area LAYER d={n} eps_r={n} r={n}", "X{w} {w} {w} {w} SLAB d={n} eps_r={n} rho={n}",
-      "X1 a b s w={x}"),
-    *("X{w} {w} 0 area SKIN d={n} f={n}", "X{w} {w} {w} area SKIN_DISPERSIVE d={n}", "X{w} a b {w} {w}={n}",
-      "Xq {w} {w}"),
-    *(".subckt s a b w={n}", ".subckt {w} {w} {w} params: {w}={x}", ".ends", ".ends s", ".end", ".control", ".endc"),
-    *(".tran {n} {n} {n} uic", ".ac dec {n} {n} {n}", ".ic v({w})={n}", ".options {w}={n}",
-      ".options work=total", ".nodeset {w}"),
-    *(".step {w} {n} {n} {n}", ".step {w} list {n} {x}", ".step dec param {w} {n} {n} {n}", ".op",
-      ".dc {w} {n} {n} {n}", ".save V({w}) @Xgap[{w}]", ".print tran {x}", ".temp {n}", ".options temp={n}",
-      ".model {w} R(tc1={n} r={n})",
-      ".meas ac {w} FIND vdb({w}) AT={n}", ".meas {w} WHEN V({w})={x} RISE={n}", ".four {n} V({w}) {{{x}}}"),
-    *(".{w}", "+ {w}={n}", "+", "* {w}", "{w}", "D1 a b d", "L1 a 0 {n}", ".title {w}",
-      "L2 a b {n} ic={n}", "K1 L1 L2 {n}", "E1 {w} 0 a b {n}", "G1 a b {w} 0 {n}", "F1 a 0 {w} {n}",
-      "H1 {w} b V1 {n}", "S1 a b {w} 0 {w}", ".model {w} SW(Ron={n} vt={n})",
-      ".meas {w}", ".func f(x) x"),
-    *(".tran {n}", ".tran 0 {n} 0 {n}", ".backanno", "R{w} {w} {w} r={n} m={n} tol={n}", "V{w} {w} 0 {s} Rser={n}",
-      "C{w} {w} {w} c={n} Rser={n} Rpar={n} Cpar={n} Lser={n}", "R1 a b {n},{n} // {w}",
-      "V1 a 0 SINE({n} {n} {n},{n})"),
-)
+LINES = tuple(listed("fuzz_lines"))
 DECKS = tuple(
     path.read_text(encoding="utf-8") for path in (*sorted(CIRCUITS.glob("*.cir")), *sorted(CIRCUITS.glob("*.lib")))
 )

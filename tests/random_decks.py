@@ -1,9 +1,9 @@
 """Random decks with every device, source and directive, and both charge laws, for the export to ngspice."""
 
 import random
-import warnings
 
 import fingerspice as fs
+from scenes import quietly
 
 GAP = "fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
 PERIOD = 1e-3
@@ -110,9 +110,7 @@ def deck(seed: int) -> tuple[str, fs.Circuit, str]:
     head = [f"Random deck {seed}: {network}, {kind}", f".include fingerspice{'_mobile' if law == 'mobile' else ''}.lib"]
     tran = f".tran {step!r} {1.5 * PERIOD!r}{extra}{' uic' if uic else ''}"
     text = "\n".join([*head, *lines, tran, rng.choice(("", ".ac dec 5 10 100k", ".options reltol=1e-5")), ".end"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        circuit = fs.parse_netlist(text)
+    circuit = quietly(fs.parse_netlist, text)
     if kind == "python":
         # A waveform that no netlist has, in place of the first source.
         first = circuit.by_device("V", "I")[0]

@@ -3,7 +3,8 @@
 import os
 import re
 import tomllib
-from collections.abc import Iterable
+import warnings
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,6 +36,34 @@ def listed(kind: str) -> list[Any]:
     """A table of `cases.toml`, such as of what is wrong and what is said."""
     rows: list[Any] = CASES[kind]
     return rows
+
+
+def refuses(said: str, call: Callable[..., object], *given: Any, **named: Any) -> str:
+    """Wrong input is refused in one line, in which the regular expression `said` is found, if any; gives the line."""
+    with pytest.raises(fs.InputError, match=said or None) as told:
+        call(*given, **named)
+    assert "\n" not in str(told.value)
+    return str(told.value)
+
+
+def warns(said: str, call: Callable[..., T], *given: Any, **named: Any) -> T:
+    """What a call gives that warns in a sentence in which the regular expression `said` is found."""
+    with pytest.warns(fs.FingerspiceWarning, match=said):
+        return call(*given, **named)
+
+
+def heard(call: Callable[..., T], *given: Any, **named: Any) -> tuple[T, list[str]]:
+    """What a call gives, and its warnings, all of which are the package's own."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = call(*given, **named)
+    assert all(one.category is fs.FingerspiceWarning for one in caught)
+    return found, [str(one.message) for one in caught]
+
+
+def quietly(call: Callable[..., T], *given: Any, **named: Any) -> T:
+    """What a call gives, whatever it warns of."""
+    return heard(call, *given, **named)[0]
 
 
 def by_turns(values: Iterable[T]) -> list[tuple[T, str]]:

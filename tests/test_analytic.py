@@ -24,9 +24,6 @@ SHARE = 1.0 / np.array([layer.c for layer in ref.table1_layers(100.0)])
 SHARE /= SHARE.sum()
 
 
-# materials ------------------------------------------------------------------------------------------------
-
-
 def test_skin_is_the_cubic_reading_of_eq_18_and_eq_19_as_printed():
     assert ref.rho_sc(1.0) == pytest.approx(10**4.9229, rel=1e-15)
     assert ref.rho_sc(10.0) == pytest.approx(10 ** (-0.023 + 0.0795 - 0.2133 + 4.9229), rel=1e-15)
@@ -109,9 +106,6 @@ def test_a_finger_that_slides_out_of_contact_is_refused():
         ref.contact(0.0, replace(ref.TABLE1, mu0=1.2))
     with pytest.raises(ValueError, match="no contact"):
         ref.area_mp(0.0, replace(ref.TABLE1, mu0=1.2))
-
-
-# phasors --------------------------------------------------------------------------------------------------
 
 
 def test_no_skin_resistivity_brings_the_100_hz_gain_below_64_6_percent():
@@ -352,9 +346,6 @@ def test_nothing_happens_at_zero_volts_and_a_picovolt_is_linear():
     small = ref.transient(ref.sine_segments(1e-12, 100.0, 0.02), t, freq=100.0)
     unit = ref.sine_frozen_from_rest(100.0, 1.0, AREA_AT_REST, t, ref.table1_layers(100.0))
     np.testing.assert_allclose(small.u * 1e12, unit, atol=1e-12)
-
-
-# coupled transients: the periodic state -----------------------------------------------------------------
 
 
 def test_a_periodic_state_repeats_itself_and_is_where_the_transient_from_rest_goes():

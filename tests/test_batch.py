@@ -10,7 +10,7 @@ import fingerspice as fs
 import recording_errors
 from batches import alike, check, population, singles, singly
 from fingerspice.circuit.circuit import Circuit
-from scenes import DECKS, cases, dispersive_deck, listed, shipped, table1, table1_deck
+from scenes import DECKS, cases, dispersive_deck, listed, refuses, shipped, table1, table1_deck
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 OUTPUTS = ("f_el_mean", "f_el_mean_periodic", "f_t_rms", "u_gap_rms")
@@ -412,5 +412,4 @@ def test_what_lockstep_does_not_take_is_said() -> None:
     assert found.attrs["ordinary"] == "the recording does not start at 0 s"
     found = fs.batch(recorded(), scenes, t_stop=T_STOP + 0.3 / RATE)
     assert "does not end after half periods or at a sample" in found.attrs["ordinary"]
-    with pytest.raises(fs.InputError, match="0 sources have a period"):
-        fs.batch(recorded(), scenes, periods=2.0)
+    refuses("0 sources have a period", fs.batch, recorded(), scenes, periods=2.0)

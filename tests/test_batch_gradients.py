@@ -9,7 +9,7 @@ import pytest
 import fingerspice as fs
 from batches import alike, population
 from fingerspice.circuit.circuit import Circuit
-from scenes import cases, shipped, table1
+from scenes import cases, refuses, shipped, table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 # Relative step of the differences: truncation about 1e-12 of the force, rounding 1e-15 over the step.
@@ -159,8 +159,7 @@ def test_the_dataset_says_what_it_holds(tmp_path: Path) -> None:
 def test_two_fingers_are_refused() -> None:
     two = shipped("two_fingers")
     gap = two.by_device("GAP")[0].name
-    with pytest.raises(fs.InputError, match="the circuit has 2 GAPs"):
-        fs.batch(two, {f"{gap}.d": [3e-6]}, gradients=(f"{gap}.d",))
+    refuses("the circuit has 2 GAPs", fs.batch, two, {f"{gap}.d": [3e-6]}, gradients=(f"{gap}.d",))
 
 
 @pytest.mark.parametrize("periodic", [False, True])

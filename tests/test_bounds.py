@@ -22,7 +22,7 @@ from fingerspice.engine.collocation import readout
 from fingerspice.solve.problem import MOST_BYTES
 from fingerspice.waveforms import periodic
 from processes import ended, start
-from scenes import CIRCUITS, listed, shipped, table1
+from scenes import CIRCUITS, listed, refuses, shipped, table1
 from waveform_cases import CASES, Case
 
 GIB = 2**30
@@ -61,8 +61,7 @@ def test_ten_values_in_a_year_of_squares_need_no_list_of_its_edges() -> None:
     square = fs.Square(200.0, 5000.0)
     t = np.array([0.0, 3e7 + 2.5e-5, 3e7 + 1.25e-4, 1.0, 1.00005])
     np.testing.assert_array_equal(square.value(t), [200.0, 200.0, -200.0, 200.0, 200.0])
-    with pytest.raises(fs.InputError, match=r"7\.5e\+11 breakpoints from 0 s to 3e\+07 s"):
-        square.breakpoints(0.0, 3e7)
+    refuses(r"7\.5e\+11 breakpoints from 0 s to 3e\+07 s", square.breakpoints, 0.0, 3e7)
     edges = np.array([1e-4, 3e7 + 1e-4])
     np.testing.assert_array_equal(square.value(edges, "left") - square.value(edges), [400.0, 400.0])
 

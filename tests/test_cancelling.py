@@ -1,7 +1,6 @@
 """Sources that cancel, carriers that coarse samples miss, common periods, and runs whose work does not jump."""
 
 import math
-import warnings
 
 import numpy as np
 import pytest
@@ -9,17 +8,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
-from scenes import DECKS, cases, every_law, table1
+from scenes import DECKS, cases, every_law, quietly, table1, warns
 
 THREE_PHASES = (DECKS / "three_phases.cir").read_text()
 # A double of 50 V is rounded by 7e-15 V: no voltage of a balanced drive is more than some hundred of these.
 ZERO = 1e-12
-
-
-def quiet(circuit: fs.Circuit, **how: object) -> fs.Solution:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        return fs.simulate(circuit, **how)  # type: ignore[arg-type]
 
 
 @every_law
@@ -27,7 +20,7 @@ def quiet(circuit: fs.Circuit, **how: object) -> fs.Solution:
 def test_a_balanced_drive_is_0_v_and_no_trouble(law: str, beside: str) -> None:
     circuit = fs.parse_netlist(THREE_PHASES.format(beside=beside))
     for rtol in (1e-4, 1e-8, 1e-11):
-        run = quiet(circuit, charge_law=law, rtol=rtol)
+        run = quietly(fs.simulate, circuit, charge_law=law, rtol=rtol)
         assert run.method != "radau"
         assert np.abs(run.u_gap).max() < ZERO
         assert run.nfev < 100_000
@@ -42,16 +35,18 @@ def test_phases_that_balance_leave_what_is_added_to_them(n: int, phase: float, f
     balanced = sum(
         (fs.Sine(50, f, phase_deg=phase + 360.0 * i / n) for i in range(1, n)), fs.Sine(50, f, phase_deg=phase)
     )
-    nothing = quiet(table1(), sources=balanced, t_stop=3.3 / f, rtol=rtol, charge=False)
+    nothing = quietly(fs.simulate, table1(), sources=balanced, t_stop=3.3 / f, rtol=rtol, charge=False)
     assert nothing.method != "radau"
     assert np.abs(nothing.u_gap).max() < ZERO
-    alone = quiet(table1(), sources=fs.Sine(100, 2 * f), t_stop=3.3 / f, rtol=rtol, charge=False)
-    both = quiet(table1(), sources=balanced + fs.Sine(100, 2 * f), t_stop=3.3 / f, rtol=rtol, charge=False)
+    alone = quietly(fs.simulate, table1(), sources=fs.Sine(100, 2 * f), t_stop=3.3 / f, rtol=rtol, charge=False)
+    both = quietly(
+        fs.simulate, table1(), sources=balanced + fs.Sine(100, 2 * f), t_stop=3.3 / f, rtol=rtol, charge=False
+    )
     assert np.abs(both.u_gap - alone.u_gap).max() <= both.error.u_gap + alone.error.u_gap
 
 
 def test_constants_that_cancel_are_0_v() -> None:
-    run = quiet(table1(), sources=fs.DC(0.1) + fs.DC(0.2) + fs.DC(-0.3))
+    run = quietly(fs.simulate, table1(), sources=fs.DC(0.1) + fs.DC(0.2) + fs.DC(-0.3))
     assert np.abs(run.u_gap).max() < 1e-15
 
 
@@ -111,8 +106,7 @@ def test_a_run_that_implicit_steps_take_over_says_so_and_why(monkeypatch: pytest
     monkeypatch.setattr(nodal, "TELL_AFTER", 0.0)
     monkeypatch.setattr(nodal, "tell", told.append)
     said = r"exponential steps gave up at t = 0.05 s.*implicit steps took over"
-    with pytest.warns(fs.FingerspiceWarning, match=said):
-        run = fs.simulate(table1(), t_stop=0.05, rtol=1e-11)
+    run = warns(said, fs.simulate, table1(), t_stop=0.05, rtol=1e-11)
     assert run.method == "radau"
     assert len(told) == 1
     assert "exponential steps gave up" in told[0]

@@ -2,8 +2,6 @@
 
 import math
 import re
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,7 @@ from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.describe import course_warnings, energy_outside, skin_error
 from fingerspice.circuit.devices import DEVICES, REST_AREA, SOURCES
 from fingerspice.waveforms.waveform import as_waveform
-from scenes import deck, finger, listed, table1, table1_deck
+from scenes import deck, finger, heard, listed, refuses, table1, table1_deck, warns
 from waveform_cases import CASES
 
 every_kind = pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids=["stack", "network"])
@@ -28,11 +26,9 @@ every_kind = pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids
 
 def of(circuit: fs.Circuit, **options: Any) -> list[str]:
     """Warnings of a run of 1 ms, which Python's own show as well."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", fs.FingerspiceWarning)
-        run = fs.simulate(circuit, t_stop=1e-3, rtol=1e-6, **options)
-    assert [str(w.message) for w in caught] == list(run.warnings)
-    return list(run.warnings)
+    run, said = heard(fs.simulate, circuit, t_stop=1e-3, rtol=1e-6, **options)
+    assert said == list(run.warnings)
+    return said
 
 
 def said(volt: float, beside: str) -> list[str]:
@@ -70,16 +66,12 @@ def test_each_of_two_fingers_is_warned_about_by_its_name() -> None:
     assert "the gap voltage of XgapFar reaches 320 V" in text
 
 
-# The circuit -------------------------------------------------------------------------------------------------
-
-
 def test_a_skin_at_another_frequency_than_the_sources_is_warned_about() -> None:
     assert of(table1()) == []
     (text,) = of(table1(), sources=fs.Square(200, 5000))
     assert text == ("Xskin takes its data at f = 100 Hz, the source's fundamental is 5000 Hz; Xskin.f=5000 would match")
     assert of(table1(), sources=fs.Square(200, 5000), parameters={"Xskin.f": 5000}) == []
-    with pytest.warns(fs.FingerspiceWarning, match=r"Xskin\.f=5000 would match"):
-        fs.plan(table1(), sources=fs.Square(200, 5000))
+    warns(r"Xskin\.f=5000 would match", fs.plan, table1(), sources=fs.Square(200, 5000))
     state = fs.steady_state(table1(), sources=fs.Square(200, 5000), rtol=1e-6)
     with pytest.warns(fs.FingerspiceWarning, match=r"Xskin\.f=5000 would match"):
         assert state.solution.warnings == (text,)
@@ -157,8 +149,6 @@ def test_a_source_that_is_not_named_stays_on_and_is_warned_about() -> None:
     assert of(circuit, sources={"Vdrive": fs.Sine(100, 5000), "Vbias": 0}) == []
 
 
-# Sources that miss the run ------------------------------------------------------------------------------------
-
 NOISE = np.random.default_rng(0).normal(0.0, 50.0, 2001)
 ROW = np.arange(2001)
 # A source, and what is said of it in a run of 1 ms; nothing of one that is ordinary.
@@ -230,39 +220,28 @@ def test_output_times_outside_the_run_are_refused_with_the_likely_slip(times: li
     assert str(refused.value).endswith(said)
 
 
-def said_by(make: Callable[[], object]) -> list[str]:
-    """Warnings of a call."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        make()
-    assert all(w.category is fs.FingerspiceWarning for w in caught)
-    return [str(w.message) for w in caught]
-
-
 #: Name, a change of the deck, its path and value if it is one in Python, what the warning says, and what was meant.
 SLIPS = listed("slips")
 
 
 @pytest.mark.parametrize(("change", "expected", "meant"), [(change, *said) for _, change, _, *said in SLIPS])
 def test_a_likely_slip_is_named_with_its_place_the_range_and_what_was_meant(change, expected: str, meant: str) -> None:
-    circuits: list[fs.Circuit] = []
-    (said,) = said_by(lambda: circuits.append(fs.parse_netlist(edited(tuple(change)), "deck.cir")))
+    circuit, (said,) = heard(fs.parse_netlist, edited(tuple(change)), "deck.cir")
     place, _, text = said.partition(": ")
     assert re.fullmatch(r"deck\.cir:[34567]:\d+", place)
     assert text.startswith(expected)
     assert "the usual range (" in text
     assert ("meant?" in text) == (meant != "")
     assert meant == "" or f"; was {meant}" in text
-    assert circuits[0].warnings == (said,)
+    assert circuit.warnings == (said,)
 
 
 @pytest.mark.parametrize(("change", "expected"), [(change, said) for _, _, change, said, _ in SLIPS if change])
 def test_a_change_in_python_and_on_the_command_line_is_warned_about_as_in_the_deck(change, expected, command) -> None:
     path, value = change
-    changed: list[fs.Circuit] = []
-    (said,) = said_by(lambda: changed.append(table1().replace({path: value})))
+    changed, (said,) = heard(table1().replace, {path: value})
     assert said.startswith(expected)
-    assert changed[0].warnings == (said,)
+    assert changed.warnings == (said,)
     (line,) = command("plan", "pad.cir", "--set", f"{path}={value!r}").lines[:1]
     assert line == f"fingerspice: warning: {said}"
 
@@ -271,42 +250,42 @@ def test_what_is_put_right_is_not_warned_about_any_more() -> None:
     with pytest.warns(fs.FingerspiceWarning):
         wrong = fs.parse_netlist(edited(("d=3.5u", "d=3.5"), ("eps_r=1 ", "eps_r=1e5 ")), "deck.cir")
     assert len(wrong.warnings) == 2
-    half: list[fs.Circuit] = []
-    assert said_by(lambda: half.append(wrong.replace({"Xgap.d": "3.5u"}))) == []
-    assert [text.partition(" is ")[0] for text in half[0].warnings] == ["deck.cir:5:36: Xgap eps_r"]
-    assert half[0].replace({"Xgap.eps_r": 1}).warnings == ()
+    half, said = heard(wrong.replace, {"Xgap.d": "3.5u"})
+    assert said == []
+    assert [text.partition(" is ")[0] for text in half.warnings] == ["deck.cir:5:36: Xgap eps_r"]
+    assert half.replace({"Xgap.eps_r": 1}).warnings == ()
 
 
 def test_a_number_with_a_trap_in_it_gets_one_word() -> None:
     for change in (("r=0.2meg", "r=0.2M"), ("d=350u", "d=1e-4\u00b5")):
-        (said,) = said_by(lambda c=change: fs.parse_netlist(edited(c)))  # type: ignore[misc]
+        (said,) = heard(fs.parse_netlist, edited(change))[1]
         assert "usual" not in said
     assert "1e-4\u00b5 is 1e-10: exponent and scale both count" in said
 
 
 def test_sources_of_screens_are_usual() -> None:
     for source in ("SIN(0 200 1)", "SIN(0 200 100k)", "DC 0", "PULSE(-150 150 0 1n 1n 4m 10m)"):
-        assert said_by(lambda s=source: fs.parse_netlist(edited(("SIN(0 200 100)", s)))) == []  # type: ignore[misc]
+        assert heard(fs.parse_netlist, edited(("SIN(0 200 100)", source)))[1] == []
 
 
 def test_a_deck_that_is_wholly_unusual_does_not_flood() -> None:
     chain = [f"R{i} n{i} n{i + 1} 1u" for i in range(250)]
-    said = said_by(lambda: fs.parse_netlist("\n".join(["t", "V1 n0 0 5", *chain, "Re n250 0 1k", ".tran 1m 1"])))
+    said = heard(fs.parse_netlist, "\n".join(["t", "V1 n0 0 5", *chain, "Re n250 0 1k", ".tran 1m 1"]))[1]
     assert len(said) == 101
     assert said[-1] == "150 more warnings are not shown"
 
 
 def test_an_area_that_a_source_or_a_start_gives_in_m2_is_warned_about() -> None:
     lines = ["t", "V1 a 0 5", "X1 a 0 area LAYER d=1u eps_r=2", "Varea area 0 35u", ".tran 1m 10m"]
-    (said,) = said_by(lambda: fs.parse_netlist("\n".join(lines), "d.cir"))
+    (said,) = heard(fs.parse_netlist, "\n".join(lines), "d.cir")[1]
     assert said.startswith("d.cir:4:1: Varea, an area, is 3.5e-05 mm^2, outside 0.1 to 2000 mm^2")
     assert said.endswith("it is in mm^2, not m^2; was 35 meant?")
-    (said, *_) = said_by(lambda: fs.parse_netlist(edited((".end", ".ic v(area)=35u\n.end"))))
+    (said, *_) = heard(fs.parse_netlist, edited((".end", ".ic v(area)=35u\n.end")))[1]
     assert said.startswith(".ic v(area) is 3.5e-05 mm^2, outside 0.1 to 2000 mm^2")
 
 
 def test_a_finger_too_small_by_values_that_are_each_usual_is_warned_about() -> None:
-    (said,) = said_by(lambda: table1(gap={"alpha": 1, "fn": "10m", "mu": 0.5, "m_exp": 0.5, "c2": 320, "n_exp": 1.4}))
+    (said,) = heard(table1, gap={"alpha": 1, "fn": "10m", "mu": 0.5, "m_exp": 0.5, "c2": 320, "n_exp": 1.4})[1]
     # Eqs. 3 and 5 without voltage: alpha fn^m_exp = 0.1 mm^2, less c2 (mu fn)^2 over that.
     area = 0.1 - 320 * (0.5 * 0.01) ** 2 / 0.1
     assert f"Xgap area at 0 V is {area:.4g} mm^2, outside 0.1 to 2000 mm^2" in said
@@ -314,16 +293,15 @@ def test_a_finger_too_small_by_values_that_are_each_usual_is_warned_about() -> N
 
 def test_a_load_that_leaves_no_contact_is_refused_with_the_likely_slip() -> None:
     for make in (lambda: fs.parse_netlist(edited(("fn=0.5", "fn=50"))), lambda: table1().replace({"Xgap.fn": 50})):
-        with pytest.raises(fs.InputError, match=r"has no contact: .* it is in newton, not millinewton; was 50m meant"):
-            make()
+        refuses(r"has no contact: .* it is in newton, not millinewton; was 50m meant", make)
 
 
 def test_results_out_of_this_world_are_warned_about() -> None:
     with pytest.warns(fs.FingerspiceWarning):
         circuit = table1(gap={"alpha": "54.4meg"}, tran="50u 10m uic")
-    said = said_by(lambda: fs.large_signal(circuit, [1e3], rtol=1e-4))
+    said = heard(fs.large_signal, circuit, [1e3], rtol=1e-4)[1]
     assert sum("force reaches" in text or "area reaches" in text for text in said) == 2
-    for said in (said_by(lambda: fs.simulate(circuit)), said_by(lambda: fs.phasor(circuit))):
+    for said in (heard(fs.simulate, circuit)[1], heard(fs.phasor, circuit)[1]):
         force, ridges = (text.partition(": ") for text in said if "reaches" in text)
         assert force[0].startswith("the electroadhesive force reaches ")
         assert force[0].endswith("N, over 100 N (as much as a finger bears)")
@@ -340,32 +318,33 @@ def test_a_pressure_that_no_layer_bears_is_warned_about_from_10_mpa_on(beside: s
     limit = math.sqrt(2.0 * 10e6 / 8.854e-12) * 50e-9
     for factor, expected in ((0.999, 0), (1.001, 1)):
         lines = (f"V1 a 0 {factor * limit!r}", "Xgap a 0 area GAP d=50n a_fix=1", ".tran 10u 100u uic", beside)
-        said = said_by(lambda lines=lines: fs.simulate(deck(*lines)))  # type: ignore[misc]
+        said = heard(fs.simulate, deck(*lines))[1]
         (*pressure,) = (text for text in said if "electric pressure" in text)
         assert len(pressure) == expected
         assert all(text.startswith("the electric pressure reaches 10.02 MPa, over 10 MPa (") for text in pressure)
 
 
 def test_a_batch_of_gaps_in_the_wrong_unit_is_warned_about_once() -> None:
-    said = said_by(lambda: fs.batch(table1(), {"Xgap.d": [2.0, 3.0, 4.0]}, rtol=1e-3, t_stop=1e-2))
+    said = heard(fs.batch, table1(), {"Xgap.d": [2.0, 3.0, 4.0]}, rtol=1e-3, t_stop=1e-2)[1]
     assert sum("Xgap d is" in text and "the usual range" in text for text in said) == 2
 
 
 def test_an_area_given_in_mm2_in_python_is_warned_about() -> None:
-    said = said_by(lambda: fs.simulate(table1(tran="50u 10m uic"), area=35.0))
+    said = heard(fs.simulate, table1(tran="50u 10m uic"), area=35.0)[1]
     assert "the contact area reaches 35 m^2, over 0.001 m^2 (10 cm^2, more than a finger has)" in " ".join(said)
 
 
 def test_shipped_decks_are_usual() -> None:
     for path in sorted((Path(__file__).parents[1] / "circuits").glob("*.cir")):
-        said = said_by(lambda d=path: fs.simulate(fs.read_netlist(d), t_stop=2e-4))  # type: ignore[misc]
+        circuit, said = heard(fs.read_netlist, path)
+        said += heard(fs.simulate, circuit, t_stop=2e-4)[1]
         # Some begin with a rest, which is all of so short a run.
         assert [text for text in said if "covers nothing of the run" not in text] == []
 
 
 def test_a_sweep_of_this_package_is_not_warned_about_value_by_value(command: Command) -> None:
     Path("pad.cir").write_text(edited(QUICK))
-    said = said_by(lambda: fs.large_signal(table1(), [200e3], rtol=1e-4))
+    said = heard(fs.large_signal, table1(), [200e3], rtol=1e-4)[1]
     assert not [text for text in said if "the usual range" in text]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
-from scenes import CIRCUITS, cases, covers, deck, listed, shipped
+from scenes import CIRCUITS, cases, covers, deck, listed, refuses, shipped, warns
 
 TRUE = {"alpha": 48.0, "m_exp": 0.45, "beta": 40.0, "n_exp": 1.6, "mu": 0.35, "c2": 4000.0}
 FN = np.geomspace(0.1, 2.0, 10)
@@ -18,11 +18,6 @@ DEPTH = np.linspace(0.3, 1.2, 8)
 EPS0 = 8.854e-12
 
 Columns = dict[str, np.ndarray]
-
-
-@pytest.fixture(scope="module")
-def circuit() -> fs.Circuit:
-    return shipped("fingerpad")
 
 
 def resting(fn: np.ndarray) -> np.ndarray:
@@ -162,8 +157,7 @@ def test_a_wrong_unit_is_warned_about(circuit: fs.Circuit) -> None:
         (resting(FN), "Xgap alpha is 4.8e.07 mm.2/N.m, outside .*the usual range"),
         (1e-6 * resting(FN) * rough, "the ridge area at rest misses the data by .* % rms"),
     ):
-        with pytest.warns(fs.FingerspiceWarning, match=said):
-            fs.fit_contact(circuit, {"fn": FN, "area": area})
+        warns(said, fs.fit_contact, circuit, {"fn": FN, "area": area})
     with (
         pytest.warns(fs.FingerspiceWarning, match="the data's largest fn is 2 kN, .*it is in newton, not millinewton"),
         pytest.raises(fs.InputError, match="fitted values do not go with the circuit's others: Xgap has no contact"),
@@ -186,9 +180,7 @@ def test_report_page_picture_and_profile_go_with_the_intervals(circuit: fs.Circu
 
 def test_the_command_reads_the_tables_of_the_examples(command: Command, tmp_path: Path) -> None:
     contact, indentation, pad = (str(CIRCUITS / name) for name in ("contact.csv", "indentation.csv", "fingerpad.cir"))
-    result = command("fit-contact", contact, indentation, pad, "--out", str(tmp_path), "--json")
-    assert result.code == 0
-    answer = json.loads(result.out)
+    answer = command("fit-contact", contact, indentation, pad, "--out", str(tmp_path), "--json").ok().json
     rows = {row["path"]: row for row in answer["parameters"]}
     assert answer["gap"] == "Xgap"
     assert {one["kind"]: one["count"] for one in answer["relations"]} == {
@@ -213,8 +205,7 @@ def test_bad_requests(circuit: fs.Circuit, tmp_path: Path, data: object, options
     if isinstance(data, str):
         (tmp_path / "a.csv").write_text(data)
         data = tmp_path / "a.csv"
-    with pytest.raises(fs.InputError, match=said):
-        fs.fit_contact(circuit, data, **options)  # type: ignore[arg-type]
+    refuses(said, fs.fit_contact, circuit, data, **options)
 
 
 def test_circuits_without_one_contact_are_refused(circuit: fs.Circuit) -> None:
@@ -224,8 +215,7 @@ def test_circuits_without_one_contact_are_refused(circuit: fs.Circuit) -> None:
         (circuit.replace({"Xgap.a_fix": 30.0}), r"Xgap.a_fix is 30 mm\^2; allowed: 0"),
         (deck("V1 a 0 1", "R1 a b 1k", "C1 b 0 1u", ".tran 1u 1m"), "this circuit has no GAP"),
     ):
-        with pytest.raises(fs.InputError, match=said):
-            fs.fit_contact(other, data)
+        refuses(said, fs.fit_contact, other, data)
     other_gap, name = (gap.name for gap in two.by_device("GAP"))
     with pytest.raises(fs.InputError, match=f"parameters is '{other_gap.lower()}.alpha'; allowed: alpha, "):
         fs.fit_contact(two, data, [f"{other_gap}.alpha"], finger=name)

@@ -15,11 +15,15 @@ from fingerspice.netlist.deck import parse_deck
 from fingerspice.netlist.expressions import Call, Number, Token
 from fingerspice.netlist.reader import Deck, Statement, text_of
 from ngspice_tools import call_ngspice
-from scenes import DECKS, listed
+from scenes import DECKS, listed, refuses
 
 
 def deck(*lines: str) -> Deck:
     return parse_deck("\n".join(["title", *lines]))
+
+
+def of_file(path: Path) -> Deck:
+    return parse_deck(*text_of(path))
 
 
 def only(*lines: str) -> Statement:
@@ -259,8 +263,7 @@ def test_fifty_random_nests_are_what_ngspice_takes_or_refused(tmp_path: Path) ->
 
 @pytest.mark.parametrize(("call", "said"), listed("captured"))
 def test_a_value_whose_name_ngspice_takes_inside_is_refused(call: str, said: str) -> None:
-    with pytest.raises(InputError, match=f"{said}; allowed: another name for one of them"):
-        parse_deck(f"captured\n.param w=7 d=2u\n{call}\n.end\n")
+    refuses(f"{said}; allowed: another name for one of them", parse_deck, f"captured\n.param w=7 d=2u\n{call}\n.end\n")
 
 
 def test_a_value_that_is_the_same_inside_is_taken(tmp_path: Path) -> None:
@@ -268,13 +271,7 @@ def test_a_value_that_is_the_same_inside_is_taken(tmp_path: Path) -> None:
     assert ours(body) == theirs(body, tmp_path) == 56.0
 
 
-@pytest.mark.parametrize(("body", "expected"), [
-    (".func par(a, b) {a*b/(a+b)}\nR1 a 0 {par(1k, 3k)}", 750.0),
-    (".func area(l,w) '(l + 1) * w'\n.func twice(x) 2*x\nR1 a 0 {twice(area(2, twice(3)))}", 36.0),
-    # Arguments are whole values: 3*(1+1), not 3*1+1; and the body has the parameters of the deck.
-    (".param k=3\n.func times(x) {k*x}\nR1 a 0 {times(1+1)}", 6.0),
-    (".func late(x) {x*n}\n.param m={late(2)} n=5\nR1 a 0 {m}", 10.0),
-])  # fmt: skip
+@pytest.mark.parametrize(("body", "expected"), listed("functions_with_values"))
 def test_functions_have_the_values_of_ngspice(tmp_path: Path, body: str, expected: float) -> None:
     assert ours(body) == expected
     # ngspice 39 takes parameters in the order of their lines.
@@ -322,12 +319,11 @@ def test_a_section_of_a_library_is_read_alone(tmp_path: Path) -> None:
         ".lib fast\n.param r=5\n.endl\n.LIB Slow\n.param r=7\n.endl slow\n.lib open\nR9 a 0 1\n"
     )
     path.write_text("t\n.lib p.lib fast\nR1 a 0 {r}\n")
-    with pytest.raises(InputError, match=r"section 'open' of the library has no \.endl"):
-        parse_deck(*text_of(path))
+    refuses(r"section 'open' of the library has no \.endl", of_file, path)
     (tmp_path / "p.lib").write_text("* two\n.lib fast\n.param r=5\n.endl\n.LIB Slow\n.param r=7\n.endl slow\n")
     for section, expected in (("fast", 5.0), ("SLOW", 7.0)):
         path.write_text(f"t\n.lib 'p.lib' {section}\nR1 a 0 {{r}}\n")
-        assert value(parse_deck(*text_of(path)).statements[0].body[0]) == expected
+        assert value(of_file(path).statements[0].body[0]) == expected
         assert theirs(f".lib 'p.lib' {section}\nR1 a 0 {{r}}", tmp_path) == expected
     for line, said in (
         (".lib p.lib slo", "the library has no section 'slo'; did you mean 'slow'?"),
@@ -335,22 +331,21 @@ def test_a_section_of_a_library_is_read_alone(tmp_path: Path) -> None:
         (".lib p.lib", "'fast' begins a section of a library; allowed: .lib FILE SECTION, which reads one"),
     ):
         path.write_text(f"t\n{line}\nR1 a 0 1\n")
-        with pytest.raises(InputError, match=re.escape(said)):
-            parse_deck(*text_of(path))
+        refuses(re.escape(said), of_file, path)
 
 
 def test_local_files_are_included_and_named_in_places(tmp_path: Path) -> None:
     path = tmp_path / "main.cir"
     path.write_text("t\n.inc 'my parts.lib'\nR1 a 0 {r}\n")
     (tmp_path / "my parts.lib").write_text(".param r=5\n.lib FingerSpice_mobile.LIB\n")
-    read = parse_deck(*text_of(path))
+    read = of_file(path)
     assert value(read.statements[0].body[0]) == 5.0
     assert read.files == [tmp_path.resolve() / "my parts.lib"]
     assert read.libraries == ["FingerSpice_mobile.LIB"]
     assert read.path == path
     (tmp_path / "my parts.lib").write_text("\n\nR1 a 0 2k7\n")
     with pytest.raises(InputError, match=r"write 2\.7k") as caught:
-        parse_deck(*text_of(path))
+        of_file(path)
     assert caught.value.where == Where(str(tmp_path / "my parts.lib"), 3, 8)
 
 
@@ -365,7 +360,7 @@ def test_other_files_are_refused_by_name(tmp_path: Path, name: str, message: str
     (folder / "end.lib").write_text(".end\n")
     (folder / "main.cir").write_text(f"t\n.include {name}\n")
     with pytest.raises(InputError, match=message) as caught:
-        parse_deck(*text_of(folder / "main.cir"))
+        of_file(folder / "main.cir")
     assert caught.value.where is not None
 
 
@@ -385,20 +380,16 @@ def test_no_name_from_outside_the_folder_is_proposed_for_a_missing_file(tmp_path
 def test_files_that_are_no_netlists_are_refused(tmp_path: Path, data: bytes, message: str) -> None:
     path = tmp_path / "main.cir"
     path.write_bytes(data)
-    with pytest.raises(InputError, match=message):
-        parse_deck(*text_of(path))
+    refuses(message, of_file, path)
 
 
 def test_missing_files_folders_and_huge_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "finger.cir").write_text("t\n")
-    with pytest.raises(InputError, match=r"does not exist; did you mean '.*/finger\.cir'\?$"):
-        parse_deck(*text_of(tmp_path / "fingr.cir"))
-    with pytest.raises(InputError, match="is a folder"):
-        parse_deck(*text_of(tmp_path))
+    refuses(r"does not exist; did you mean '.*/finger\.cir'\?$", of_file, tmp_path / "fingr.cir")
+    refuses("is a folder", of_file, tmp_path)
     with (tmp_path / "huge.cir").open("wb") as huge:
         huge.truncate(2**27)
-    with pytest.raises(InputError, match="has 128 MiB; allowed: at most 64 MiB"):
-        parse_deck(*text_of(tmp_path / "huge.cir"))
+    refuses("has 128 MiB; allowed: at most 64 MiB", of_file, tmp_path / "huge.cir")
 
 
 def test_reading_a_deck_imports_nothing_heavy() -> None:

@@ -80,8 +80,7 @@ def steady(circuit: fs.Circuit, law: str = "local") -> str:
 
 def files() -> dict[str, str]:
     """Digest of every kind of file."""
-    circuit = table1(tran="50u 20m uic")
-    solution = fs.simulate(circuit)
+    solution = fs.simulate(table1(tran="50u 20m uic"))
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         solution.to_netcdf(folder / "x.nc")

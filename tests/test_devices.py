@@ -13,6 +13,7 @@ from fingerspice.circuit.devices import DEVICES, DeviceSpec, ParameterSpec, Usua
 from fingerspice.netlist.reader import LIBRARIES, shipped_text
 from fingerspice.physics.materials import EPS0
 from ngspice_tools import beside
+from scenes import warns
 
 #: Parameters of the bodies that say how a run starts, and the reading of Eq. 7: the export writes them.
 OF_THE_EXPORT = {"ic", "a_ic", "wk"}
@@ -100,8 +101,7 @@ def test_a_new_device_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "X1 a 0 area GEL d=0.0001 rho=10000.0" in fs.export_netlist(gel)
     with pytest.raises(fs.InputError, match=r"devices are LAYER SLAB SKIN SKIN_DISPERSIVE GAP CPE CPE_LAYER GEL"):
         fs.parse_netlist(head + "X1 a 0 area QQQQ d=100u\n")
-    with pytest.warns(fs.FingerspiceWarning, match="X1 d is 100 nm, outside 1 um to 10 mm"):
-        gel.replace({"X1.d": "100n"})
+    warns("X1 d is 100 nm, outside 1 um to 10 mm", gel.replace, {"X1.d": "100n"})
     # An entry without its cells is refused when it is written.
     with pytest.raises(TypeError, match="device GEL: an area node and cells belong together; give both, or neither"):
         DeviceSpec("GEL", ("p", "n", "area"), ())

@@ -10,7 +10,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.describe import energy_outside
 from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
-from scenes import CIRCUITS, cases, dispersive_deck, every_law, table1_deck
+from scenes import CIRCUITS, cases, dispersive_deck, every_law, refuses, table1_deck, warns
 
 BAND = np.geomspace(*SKIN_BAND, 401)
 D = 350e-6
@@ -123,8 +123,7 @@ def test_bad_requests_are_refused(tmp_path: Path) -> None:
         (lambda: fs.ColeCole(1.0, ((1.0, 1.0, 1.0),)), "alpha is 1"),
         (lambda: fs.fit_material(rows, poles=3).to_netlist("my skin"), "name is 'my skin'"),
     ):
-        with pytest.raises(fs.InputError, match=says):
-            call()
+        refuses(says, call)
 
 
 @every_law
@@ -249,8 +248,7 @@ OUTSIDE = {
 
 @pytest.mark.parametrize("source", OUTSIDE)
 def test_energy_outside_the_data_is_warned_about(source: str) -> None:
-    with pytest.warns(fs.FingerspiceWarning, match=OUTSIDE[source]):
-        fs.simulate(dispersive(source), t_stop=2e-3, rtol=1e-4)
+    warns(OUTSIDE[source], fs.simulate, dispersive(source), t_stop=2e-3, rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -113,8 +113,7 @@ def test_the_code_of_a_page_runs(page: Path, command: Command, tmp_path: Path, m
             printed = out.getvalue()
         for arguments in commands_of(block) if block.language == "sh" else []:
             map_of_folds = arguments[0] == "limits" and "--capability" not in arguments
-            result = command(*arguments, *(cases([], ["--points", "3"]) if map_of_folds else []))
-            assert result.code == 0, (arguments, result.err)
+            result = command(*arguments, *(cases([], ["--points", "3"]) if map_of_folds else [])).ok()
             printed = result.out
         if block.language == "text":
             # What a page shows was printed by the block before.
@@ -194,14 +193,11 @@ def test_the_command_draws_decks_and_scenes(tmp_path: Path, command: Command, mo
     shutil.copy(CIRCUITS / "click.cir", tmp_path / "circuits")
     some = EXAMPLES[:: cases(1, 7)]
     monkeypatch.setattr("fingerspice.explorer.scene.EXAMPLES", some)
-    result = command("figures", "--gallery", "--out", "out")
-    assert result.code == 0
+    result = command("figures", "--gallery", "--out", "out").ok()
     drawn = {path.stem for path in (tmp_path / "out" / "gallery").glob("*.png")}
     assert drawn == {"click", *(f"scene-{one['name']}" for one in some)}
     assert all(name in result.out for name in drawn)
-    result = command("figures", "--gallery", "--only", "4")
-    assert result.code == 2
-    assert "--only and --gallery are both given" in result.err
+    command("figures", "--gallery", "--only", "4").refused("--only and --gallery are both given")
 
 
 def test_every_picture_of_a_page_can_be_drawn_and_is_shown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import math
 import re
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from fingerspice.circuit.circuit import Tran
 from fingerspice.netlist.lexer import decimal_comma
 from fingerspice.netlist.reader import ELSEWHERE, LIBRARIES, shipped_text
 from ngspice_tools import beside, call_ngspice, with_max_step
-from scenes import DECKS, listed
+from scenes import DECKS, heard, listed, warns
 
 TRAN = ".tran 10u 50m uic"
 OTHERS = sorted((DECKS / "others").glob("*.cir"))
@@ -25,10 +24,7 @@ OTHERS = sorted((DECKS / "others").glob("*.cir"))
 
 def read(*changes: tuple[str, str]) -> tuple[fs.Circuit, list[str]]:
     """The deck, and what was said of it."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        circuit = fs.parse_netlist(edited(*changes), "deck.cir")
-    return circuit, [str(w.message) for w in caught]
+    return heard(fs.parse_netlist, edited(*changes), "deck.cir")
 
 
 def test_what_ltspice_saves_loads_and_is_the_same_circuit_as_ours() -> None:
@@ -103,8 +99,7 @@ def test_a_run_whose_source_has_ac_alone_is_warned_about(beside: str) -> None:
     circuit, said = read(("SIN(0 200 100)", "AC 200 100"), (".end", f"{beside}.end"))
     assert said == []
     expected = r"0 all the time: Vdrive has AC alone, which drives sweeps .* SIN\("
-    with pytest.warns(fs.FingerspiceWarning, match=expected):
-        fs.simulate(circuit, t_stop=1e-4)
+    warns(expected, fs.simulate, circuit, t_stop=1e-4)
 
 
 def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
@@ -170,14 +165,12 @@ def test_a_changed_library_beside_the_deck_is_warned_about_for_it_is_not_read(na
     ):  # fmt: skip
         if text is not None:
             (tmp_path / name).write_text(text, newline="")
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            circuit = fs.read_netlist(path)
+        circuit, told = heard(fs.read_netlist, path)
         said = (
             f"{path}:2:10: '{name}' differs from this version's and is not read: the devices are built in here, and "
             "only ngspice would run the changed ones"
         )
-        assert [str(w.message) for w in caught] == [said][:expected]
+        assert told == [said][:expected]
         assert circuit.warnings == (said,)[:expected]
     assert circuit.charge_law == law
 

@@ -32,19 +32,12 @@ from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer import MOST_BYTES, Explorer, pages
 from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS, WAVEFORMS
 from fingerspice.explorer.scene import EXAMPLES, as_deck, as_python, scene
-from scenes import DECKS, cases, listed
+from scenes import DECKS, cases, heard, listed, quietly, refuses
 
 ROOT = Path(__file__).parents[1]
 SINE = EXAMPLES[0]["request"]["deck"]
 BY_NAME = {e["name"]: e["request"] for e in EXAMPLES}
 OWN = (DECKS / "own.cir").read_text()
-
-
-@pytest.fixture(scope="module")
-def explorer() -> Iterator[Explorer]:
-    running = fs.explore(browser=False)
-    yield running
-    running.stop()
 
 
 def packed(values: list[float]) -> str:
@@ -135,13 +128,9 @@ def test_the_values_of_a_scene_are_those_of_simulate(explorer: Explorer) -> None
     t = answer["t"]
     assert t.size == POINTS
     np.testing.assert_allclose(t, np.linspace(5e-3, 15e-3, POINTS), rtol=1e-14)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        circuit = fs.parse_netlist(SINE).replace({"Xgap.d": 4e-6, "Xgap.fn": 0.7})
-        expected = fs.simulate(
-            circuit, sources=fs.Square(150.0, 200.0), charge_law="mobile", rtol=1e-7, t_stop=15e-3, t_eval=t,
-            charge=False,
-        )  # fmt: skip
+    circuit = fs.parse_netlist(SINE).replace({"Xgap.d": 4e-6, "Xgap.fn": 0.7})
+    how = {"charge_law": "mobile", "rtol": 1e-7, "t_stop": 15e-3, "t_eval": t, "charge": False}
+    expected = quietly(fs.simulate, circuit, sources=fs.Square(150.0, 200.0), **how)
     signals = {trace["name"]: trace["values"] for trace in answer["traces"]}
     assert set(signals) == {"u_source", "u_gap", "f_el", "area", "friction"}
     for name, values in signals.items():
@@ -307,10 +296,9 @@ def test_the_python_of_a_scene_gives_its_traces(asks: dict[str, Any]) -> None:
 
 def test_the_deck_of_a_scene_gives_its_traces() -> None:
     request = {"deck": SINE, "overrides": {"Xgap.d": "4u"}, "source": "SIN(0 150 200)", "skin": "follow"}
-    with warnings.catch_warnings():
-        # The deck holds ngspice's subcircuits of the devices.
-        warnings.filterwarnings("ignore", ".*not read$")
-        circuit = fs.parse_netlist(as_deck(request))
+    # The deck holds ngspice's subcircuits of the devices.
+    circuit, said = heard(fs.parse_netlist, as_deck(request))
+    assert all(text.endswith("not read") for text in said)
     answer = scene(request)
     solution = fs.simulate(circuit, t_eval=answer["t"], rtol=1e-6)
     np.testing.assert_allclose(solution.f_el, answer["traces"][2]["values"], atol=1e-6)
@@ -441,10 +429,8 @@ def test_bodies_that_are_too_large_or_no_json_are_refused(explorer: Explorer) ->
     for path in ("../server.py", "%2e%2e/server.py"):
         refused(*asked(explorer, path, None), 404)
     assert "the request is list" in post(explorer, [])["message"]
-    with pytest.raises(fs.InputError, match="cannot be used"):
-        Explorer(port=explorer.port)
-    with pytest.raises(fs.InputError, match="allowed: 0 to 65535"):
-        Explorer(port=70_000)
+    refuses("cannot be used", Explorer, port=explorer.port)
+    refuses("allowed: 0 to 65535", Explorer, port=70_000)
 
 
 _WORDS = st.sampled_from(

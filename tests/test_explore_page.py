@@ -22,13 +22,6 @@ SINE = fs.parse_netlist(EXAMPLES[0]["request"]["deck"])
 
 
 @pytest.fixture(scope="module")
-def explorer() -> Iterator[fs.Explorer]:
-    running = fs.explore(browser=False)
-    yield running
-    running.stop()
-
-
-@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as started:
         yield started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

@@ -15,6 +15,7 @@ from commands import Command
 from fingerspice.explorer import framed
 from fingerspice.explorer.request import asked_by, read_source, text_of
 from fingerspice.explorer.scene import EXAMPLES, applied, as_python, before, scene
+from scenes import refuses
 from test_explore import baked, run_as_python
 
 DECKS = {example["name"]: example["request"]["deck"] for example in EXAMPLES}
@@ -92,8 +93,7 @@ def test_a_set_that_does_not_fit_is_refused_in_a_sentence() -> None:
         (None, "allowed: the name of a set"),
         ("Fig4-100Hz", "the circuit has Vdrive, Vfast; allowed: one of these names"),
     ):  # fmt: skip
-        with pytest.raises(fs.InputError, match=re.escape(words)):
-            applied({"deck": DECKS["tones"], "apply": entry})
+        refuses(re.escape(words), applied, {"deck": DECKS["tones"], "apply": entry})
 
 
 def test_a_set_in_a_link_that_means_nothing_is_said_and_the_rest_is_shown() -> None:
@@ -177,6 +177,5 @@ def test_the_command_takes_sets_as_run_does_and_refuses_others(command: Command,
         ("pad.cir --finger 3M", "the set '3M' is a coating, not a finger"),
         ("pad.cir --set moits", "unknown set 'moits'; nearest: 'moist', 'light'; or PATH=VALUE"),
     ):
-        result = command("explore", *wrong.split(), "--no-browser", "--json")
-        assert result.code == 2
+        result = command("explore", *wrong.split(), "--no-browser", "--json").refused()
         assert said in json.loads(result.out)["message"]

@@ -13,7 +13,7 @@ import fingerspice as fs
 from commands import Command
 from fingerspice import studies
 from fingerspice.studies.feel import FINGERPAD, GRAVITY, SkinMechanics, Threshold, android_threshold, feel
-from scenes import deck, listed, table1
+from scenes import deck, listed, refuses, table1
 
 ROOT = Path(__file__).parents[1]
 EPS0, D, MU, LOAD = 8.854e-12, 3.5e-6, 0.3, 0.5
@@ -191,8 +191,7 @@ def test_bands_add_up_to_the_variance_of_noise() -> None:
 
 @pytest.mark.parametrize(("kind", "given", "named", "said"), listed("feelings"))
 def test_mechanics_and_thresholds_without_sense_are_refused(kind: str, given: list[Any], named: Any, said: str) -> None:
-    with pytest.raises(fs.InputError, match=said):
-        getattr(studies.feel, kind)(*given, **named)
+    refuses(said, getattr(studies.feel, kind), *given, **named)
 
 
 def test_what_cannot_be_felt_is_refused(frozen: fs.Solution) -> None:
@@ -201,10 +200,8 @@ def test_what_cannot_be_felt_is_refused(frozen: fs.Solution) -> None:
         ({"threshold": 3.0}, "a Threshold"),
         ({"mechanics": "soft"}, "a SkinMechanics"),
     ):
-        with pytest.raises(fs.InputError, match=said):
-            feel(frozen, **given)  # type: ignore[arg-type]
-    with pytest.raises(fs.InputError, match="no GAP"):
-        feel(fs.simulate(deck("V1 a 0 SIN(0 1 100)", "R1 a 0 1k", ".tran 1m 20m")))
+        refuses(said, feel, frozen, **given)
+    refuses("no GAP", feel, fs.simulate(deck("V1 a 0 SIN(0 1 100)", "R1 a 0 1k", ".tran 1m 20m")))
 
 
 def test_the_picture_has_the_threshold_and_every_finger() -> None:
@@ -223,8 +220,7 @@ def test_the_picture_has_the_threshold_and_every_finger() -> None:
 
 
 def test_run_says_what_is_felt_and_draws_it(command: Command) -> None:
-    result = command("run", "pad.cir", "--feel", "--out", "out")
-    assert result.code == 0
+    result = command("run", "pad.cir", "--feel", "--out", "out").ok()
     assert "felt: strongest at 200 Hz" in result.out
     assert "held in the hand" in result.out
     assert Path("out/pad_feel.png").is_file()
@@ -249,7 +245,5 @@ def test_run_refuses_to_feel_without_a_gap_before_it_runs(command: Command) -> N
 def test_a_run_whose_friction_cannot_be_judged_keeps_its_files(command: Command) -> None:
     # Ten outputs are too few for a density.
     words = ("run", "pad.cir", "--feel", "--source", "PWL(0 0 1m 200)", "--stop", "0.4m", "--no-plot", "--out", "out")
-    result = command(*words)
-    assert result.code == 2
-    assert "64 outputs or more" in result.err
+    command(*words).refused("64 outputs or more")
     assert Path("out/pad.nc").is_file()

@@ -14,15 +14,10 @@ from analytic import impedance, table1_layers
 from fingerspice.base.errors import InputError
 from fingerspice.studies import fit as circuitfit
 from fingerspice.studies.fit.fitting import Fitted, followed
-from scenes import CIRCUITS, cases, covers, listed, shipped, table1, table1_deck
+from scenes import CIRCUITS, cases, covers, listed, refuses, shipped, table1, table1_deck, warns
 
 TRUE = {"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6, "Xgap.alpha": 48.0}
 Data = dict[str, np.ndarray]
-
-
-@pytest.fixture(scope="module")
-def circuit() -> fs.Circuit:
-    return shipped("fingerpad")
 
 
 @pytest.fixture(scope="module")
@@ -141,8 +136,7 @@ def test_circuits_that_have_no_such_mean_are_refused(circuit):
         (two, "the circuit has 2 GAPs; allowed: one"),
         (dataclasses.replace(circuit, tran=None), "the deck has no .tran, and average is 'run'; allowed"),
     ):
-        with pytest.raises(InputError, match=said):
-            fs.fit(other, ONE, [f"{other.by_device('GAP')[0].name}.d"], average="run")
+        refuses(said, fs.fit, other, ONE, [f"{other.by_device('GAP')[0].name}.d"], average="run")
     with pytest.raises(InputError, match="none of the starts can be run: the source has no fundamental: "):
         fs.fit(shipped("am_carrier"), {"Xgap.d": [3e-6], "impedance": [1e5]}, ["Xcoat.d"], starts=1)
 
@@ -312,9 +306,7 @@ def test_the_command_fits_the_tables_of_the_examples(command):
     ):
         places = str(CIRCUITS / table), str(CIRCUITS / "fingerpad.cir")
         out = table.partition(".")[0]
-        result = command("fit", *places, "--free", *words, "--skin", "follow", "--out", out, "--json")
-        assert result.code == 0
-        answer = json.loads(result.out)
+        answer = command("fit", *places, "--free", *words, "--skin", "follow", "--out", out, "--json").ok().json
         assert answer["groups"] == groups
         rows = {row["path"]: row["low"] < true[row["path"]] < row["high"] for row in answer["parameters"]}
         assert rows == dict.fromkeys(true, True)
@@ -369,8 +361,7 @@ def test_a_report_has_the_layout_of_lmfit(example):
 def test_a_skin_held_at_one_frequency_is_told_and_biases_the_fit(circuit, data, command):
     said = r"Xskin takes its data at f = 100 Hz, the source's fundamental is 30 to 500 Hz; with skin 'follow'"
     finger = circuit.replace({path: TRUE[path] for path in ("Xgap.r", "Xgap.alpha")})
-    with pytest.warns(fs.FingerspiceWarning, match=said):
-        held = fs.fit(finger, data, ["Xgap.d"], starts=1)
+    held = warns(said, fs.fit, finger, data, ["Xgap.d"], starts=1)
     followed = fs.fit(finger, data, ["Xgap.d"], starts=1, skin="follow")
     assert followed.estimates["Xgap.d"].value == pytest.approx(TRUE["Xgap.d"], rel=1e-5)
     assert abs(held.estimates["Xgap.d"].value / TRUE["Xgap.d"] - 1.0) > 0.01
@@ -404,8 +395,7 @@ def test_data_in_another_unit_are_told_and_end_in_a_bounded_number_of_evaluation
 ):
     # Of one value: many of these evaluations are far from any finger, and slow.
     some = {key: (factor if key == column else 1.0) * x[[row]] for key, x in data.items()}
-    with pytest.warns(fs.FingerspiceWarning, match=said):
-        found = fs.fit(circuit, some, ["Xgap.d"], starts=1, rtol=1e-4, skin="follow")
+    found = warns(said, fs.fit, circuit, some, ["Xgap.d"], starts=1, rtol=1e-4, skin="follow")
     assert found.evaluations <= 40
     assert "sigma unknown, as there are no more values than parameters" in str(found)
     assert 1e-3 <= found.estimates["Xgap.d"].value / 3.5e-6 <= 1e3
@@ -423,8 +413,7 @@ def test_the_axes_of_a_fits_picture_have_names_and_units(circuit, example):
 def test_a_start_outside_its_bounds_moves_into_them_and_a_value_at_one_is_named(circuit, data):
     finger = circuit.replace({path: TRUE[path] for path in ("Xgap.r", "Xgap.alpha")})
     said = r"Xgap\.d is 3\.5e-06, outside its bounds 2e-06 to 3\.3e-06: it starts at 3\.3e-06"
-    with pytest.warns(fs.FingerspiceWarning, match=said):
-        found = fs.fit(finger, data, ["Xgap.d"], bounds={"Xgap.d": (2e-6, 3.3e-6)}, starts=1, skin="follow")
+    found = warns(said, fs.fit, finger, data, ["Xgap.d"], bounds={"Xgap.d": (2e-6, 3.3e-6)}, starts=1, skin="follow")
     assert found.estimates["Xgap.d"].value == pytest.approx(TRUE["Xgap.d"], rel=1e-5)
     assert found.estimates["Xgap.d"].initial == 3.3e-6
     found = fs.fit(circuit, data, ["Xgap.d", "Xgap.r"], bounds={"Xgap.d": (3.45e-6, 4e-6)}, starts=1, skin="follow")
@@ -471,5 +460,4 @@ def test_laws_are_compared_by_akaikes_criterion_or_said_not_to_be_told_apart() -
 @pytest.mark.parametrize(("laws", "count", "said"), listed("comparisons_of_laws"))
 def test_wrong_comparisons_of_laws_are_refused(laws: dict[str, list[str]], count: int, said: str) -> None:
     data = {"Vdrive.amplitude": np.linspace(20.0, 100.0, count), "area_mean": np.linspace(35.0, 35.2, count) * 1e-6}
-    with pytest.raises(fs.InputError, match=said):
-        fs.compare_laws(table1(), data, laws)
+    refuses(said, fs.compare_laws, table1(), data, laws)

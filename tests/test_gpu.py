@@ -13,7 +13,7 @@ import pytest
 import fingerspice as fs
 from fingerspice.engine.lockstep import card
 from fingerspice.engine.lockstep.card import thread_kernel
-from scenes import cases
+from scenes import cases, refuses
 
 ROOT = Path(__file__).resolve().parents[1]
 Simulated = dict[str, dict[str, Any]]
@@ -95,15 +95,13 @@ def test_gap_voltages_stay_on_the_processor(simulated: Simulated) -> None:
 def test_what_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     circuit = fs.read_netlist(ROOT / "circuits" / "fingerpad.cir")
     scenes = {"Xgap.d": [3e-6]}
-    with pytest.raises(fs.InputError, match=r"device is 'gpu'; allowed: 'cpu' or 'cuda'"):
-        fs.batch(circuit, scenes, device="gpu")
+    refuses(r"device is 'gpu'; allowed: 'cpu' or 'cuda'", fs.batch, circuit, scenes, device="gpu")
     monkeypatch.setattr(card, "find_spec", lambda name: None)
     card.card_compiler.cache_clear()
     with pytest.raises(fs.InputError, match=r"no compiler for graphics cards is installed; .*fingerspice\[gpu\]"):
         fs.batch(circuit, scenes, device="cuda")
     monkeypatch.setattr(card, "card_compiler", lambda: type("Cuda", (), {"is_available": staticmethod(lambda: False)}))
-    with pytest.raises(fs.InputError, match="no card was found"):
-        fs.batch(circuit, scenes, device="cuda")
+    refuses("no card was found", fs.batch, circuit, scenes, device="cuda")
 
 
 @pytest.mark.parametrize(("modes", "pieces"), [(2, 20), (8, 0), (2, 0)][: cases(3, 1)])

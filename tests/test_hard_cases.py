@@ -48,8 +48,6 @@ def check(solution: fs.Solution, expected: ref.Transient, steps: int, rounded: f
     assert solution.nfev <= 30 * 13 * (solution.stats["steps"] + solution.stats["rejected"])
 
 
-# Extreme leaks ----------------------------------------------------------------------------------------------
-
 LEAKS = {
     "R_i = 1 ohm": (1.0, 1e6), "R_i = 1e15": (1e15, 1e6), "R_a = 1e12": (2e5, 1e12),
     "R_i = 1 ohm, R_a = 1e12": (1.0, 1e12), "coating a pure capacitor": (math.inf, 1e6),
@@ -101,8 +99,6 @@ def test_without_any_resistor_the_stack_is_a_divider(method: str, law: str) -> N
         assert solution.stats["steps"] <= 50
 
 
-# Jumps ------------------------------------------------------------------------------------------------------
-
 JUMPS = {
     "at t = 0": [(0.0, 0.0), (0.0, 120.0), (0.01, -30.0)],
     "at t_stop": [(0.0, 40.0), (0.01, 120.0), (0.01, -80.0), (0.02, -80.0)],
@@ -144,9 +140,6 @@ def test_both_one_sided_values_of_a_jump_are_right(case: str, given: str, law: s
     np.testing.assert_allclose(jumped, sizes, rtol=1e-13)
 
 
-# Edges of 1 ns ----------------------------------------------------------------------------------------------
-
-
 def pulse(start: float, width: float) -> list[tuple[float, float]]:
     """Corners of a pulse of 200 V with edges of 1 ns, up to 10 ms."""
     rise = [(start, 0.0), (start + NS, 200.0)]
@@ -170,8 +163,7 @@ def test_declared_edges_of_a_nanosecond_are_not_missed(kind: str, width: float, 
     t = around(points)
     expected = ref.transient(ref.pwl_segments(points), t, law=law, freq=100.0)
     if kind == "deck":
-        circuit = table1(f"PULSE(0 200 3m 1n 1n {width!r} 1)")
-        solution = fs.simulate(circuit, t_stop=0.01, t_eval=t, charge_law=law)
+        solution = fs.simulate(table1(f"PULSE(0 200 3m 1n 1n {width!r} 1)"), t_stop=0.01, t_eval=t, charge_law=law)
     else:
         solution = run(fs.PWL(*zip(*points, strict=True)), law, t_stop=0.01, t_eval=t)
     check(solution, expected, steps=100, rounded=EDGE_ROUNDED)
@@ -211,9 +203,6 @@ def test_an_undeclared_pulse_that_outputs_stand_in_is_not_missed_without_a_word(
         run(lambda t: np.interp(t, *zip(*points, strict=True)), t_stop=0.01, t_eval=around(points))
 
 
-# High voltage -----------------------------------------------------------------------------------------------
-
-
 @lru_cache(None)
 def two_kilovolt(shape: str, law: str) -> ref.Transient:
     segments = {"sine": ref.sine_segments(2000.0, 100.0, 0.02), "square": ref.square_segments(2000.0, 100.0, 2)}
@@ -231,9 +220,6 @@ def test_two_kilovolt_are_solved_and_the_breakdown_of_air_is_warned_about(shape:
     for warning, part in zip(said, about, strict=True):
         assert part in str(warning.message)
     check(solution, two_kilovolt(shape, law), steps=200)
-
-
-# Nothing, almost nothing, and for ever ------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:the sources are 0 all the time", "ignore:the source is a function")
@@ -288,8 +274,6 @@ def test_what_decays_for_a_million_time_constants_passes_the_smallest_numbers(la
     assert solution.stats["steps"] <= 10_000
 
 
-# A hundred thousand cycles ------------------------------------------------------------------------------------
-
 CYCLES = 100_000
 LONG = {
     "sine with offset": (fs.Sine(150.0, 5000.0, offset=40.0), ref.sine_segments(150.0, 5000.0, 2e-4, offset=40.0)),
@@ -303,8 +287,7 @@ def test_a_hundred_thousand_cycles_do_not_drift(shape: str, method: str) -> None
     source, segments = LONG[shape]
     phase = np.linspace(0.0, 2e-4, 33)[1:-1] + 1e-8
     t = (CYCLES - 1.0) / 5000.0 + phase
-    circuit = table1(f=5000.0)
-    solution = run(source, "local", circuit, t_stop=CYCLES / 5000.0, t_eval=t, rtol=1e-9, method=method)
+    solution = run(source, "local", table1(f=5000.0), t_stop=CYCLES / 5000.0, t_eval=t, rtol=1e-9, method=method)
     want = ref.periodic_state(segments, freq=5000.0, t_out=phase)
     peak = np.abs(want.u_gap).max()
     # The reference's phase is exact, that of the run is rounded at 20 s: 4e-15 s of the steepest change.
@@ -344,9 +327,6 @@ def test_ten_million_cycles_need_no_more_memory_than_a_thousand(source: fs.Wavef
         tracemalloc.stop()
     # One window of the source's edges.
     assert peaks[1] <= 1.1 * peaks[0] + 5e6
-
-
-# Modulation -------------------------------------------------------------------------------------------------
 
 
 @every_law

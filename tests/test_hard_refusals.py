@@ -222,8 +222,7 @@ def test_a_fold_says_when_where_why_and_what_to_change(beside: str) -> None:
 
 def test_an_error_that_cannot_be_met_is_put_in_figures() -> None:
     # The gap takes so little of the source that rounding of the source is more than the error asked for.
-    circuit = table1(gap={"r": "1u"})
-    solution = fs.simulate(circuit, t_stop=5e-3, rtol=1e-12, throw=False)
+    solution = fs.simulate(table1(gap={"r": "1u"}), t_stop=5e-3, rtol=1e-12, throw=False)
     failure = solution.failure
     assert failure is not None
     assert failure.status is fs.Status.ERROR_NOT_MET

@@ -7,7 +7,7 @@ import analytic
 import fingerspice as fs
 from network_reference import deck_of, random_network
 from ngspice_tools import CIRCUITS, beside
-from scenes import LAWS, cases, deck, every_law, finger, listed, table1
+from scenes import LAWS, cases, deck, every_law, finger, listed, refuses, table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:.* has no effect here")
 
@@ -202,8 +202,7 @@ def test_a_start_from_rest_has_the_area_at_rest_though_the_source_jumps(law: str
 
 @pytest.mark.parametrize(("line", "said"), listed("no_starts"))
 def test_a_voltage_or_an_area_that_cannot_be_is_refused(line: str, said: str) -> None:
-    with pytest.raises(fs.InputError, match=said):
-        table1(extra=line)
+    refuses(said, table1, extra=line)
 
 
 def test_start_values_without_effect_are_listed() -> None:

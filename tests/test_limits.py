@@ -15,7 +15,7 @@ import fingerspice as fs
 from commands import Command
 from fingerspice.studies import limits
 from fingerspice.studies.limits import fold_voltage
-from scenes import CIRCUITS, cases, deck, shipped, table1, table1_deck
+from scenes import CIRCUITS, cases, deck, refuses, shipped, table1, table1_deck
 
 
 @pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
@@ -97,15 +97,12 @@ def test_a_map_needs_a_gap_and_a_source_and_an_end() -> None:
         (table1(), 1, "points is 1; allowed: 3 to 1000"),
         (table1().replace({"Vdrive": fs.DC(0.0)}), 9, "needs a V element with a voltage"),
     ):
-        with pytest.raises(fs.InputError, match=said):
-            fs.fold_limits(circuit, points=points)
+        refuses(said, fs.fold_limits, circuit, points=points)
 
 
 def test_the_command_writes_a_table_a_picture_and_json(command: Command) -> None:
     Path("pad.cir").write_text(table1_deck(tran="10u 5m uic", gap={"d": "300n"}))
-    result = command("limits", "pad.cir", "--points", "3", "--span", "2", "--out", "maps", "--json")
-    assert result.code == 0
-    report = json.loads(result.out)
+    report = command("limits", "pad.cir", "--points", "3", "--span", "2", "--out", "maps", "--json").ok().json
     assert report["sweeps"][0]["unit"] == "N"
     assert math.isfinite(report["voltage"])
     assert Path("maps/pad_limits.png").read_bytes().startswith(b"\x89PNG")
@@ -211,8 +208,7 @@ def test_it_is_refused_in_one_sentence() -> None:
         (table1(), -1.0, 100.0, "limit is -1 V"),
         (table1(), 100.0, 500.0, "a quarter of the carrier"),
     ):
-        with pytest.raises(fs.InputError, match=said):
-            fs.capability(circuit, limit, carrier=1000.0, frequency=[frequency])
+        refuses(said, fs.capability, circuit, limit, carrier=1000.0, frequency=[frequency])
 
 
 def test_the_page_names_no_drive_and_the_picture_is_a_map_and_a_curve() -> None:

@@ -2,7 +2,6 @@
 
 import json
 import pickle
-import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -17,7 +16,7 @@ from scipy.io import wavfile
 import fingerspice as fs
 from fingerspice.results import runfile
 from fingerspice.results.runfile import GROUP
-from scenes import listed, shipped, table1, table1_deck
+from scenes import listed, quietly, refuses, shipped, table1, table1_deck, warns
 
 AM = fs.AM(150.0, 5000.0, 50.0) + 3.0 * fs.Square(1.0, 50.0, duty=0.25)
 
@@ -138,9 +137,7 @@ def test_a_file_holds_what_a_deck_includes_and_plays(tmp_path: Path) -> None:
             "\n".join([".include gap.inc" if line.startswith("Xgap") else line for line in deck])
         )
         circuit = fs.read_netlist(tmp_path / "pad.cir")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            run = fs.simulate(circuit, rtol=1e-5, area="frozen")
+        run = quietly(fs.simulate, circuit, rtol=1e-5, area="frozen")
         again = fs.load(run.to_netcdf(tmp_path / "run.nc")).circuit
         assert [(e.name, e.nodes, e.values, repr(e.waveform)) for e in again.elements] == [
             (e.name, e.nodes, e.values, repr(e.waveform)) for e in circuit.elements
@@ -152,8 +149,7 @@ def test_a_source_too_long_for_a_file_leaves_a_circuit_without_elements(tmp_path
     monkeypatch.setattr(runfile, "MOST_NUMBERS", 399)
     run = fs.simulate(table1("DC 0"), sources=fs.Samples(RECORDING, 8000.0), t_stop=2e-3, area="frozen")
     said = "its sources have 400 numbers, and a file keeps at most 399.; its elements are left out"
-    with pytest.warns(fs.FingerspiceWarning, match=said):
-        again = fs.load(run.to_netcdf(tmp_path / "run.nc"))
+    again = warns(said, fs.load, run.to_netcdf(tmp_path / "run.nc"))
     assert again.circuit.elements == ()
     assert "(changed: Vdrive = " in str(again)
     assert again.f_el_mean == run.f_el_mean
@@ -176,8 +172,7 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
     ):
         if make is not None:
             make(tmp_path / name)
-        with pytest.raises(fs.InputError, match=r"\.nc .*; allowed: a (NetCDF )?file that to_netcdf or the command"):
-            fs.load(tmp_path / name)
+        refuses(r"\.nc .*; allowed: a (NetCDF )?file that to_netcdf or the command", fs.load, tmp_path / name)
 
 
 def changed(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
@@ -206,8 +201,7 @@ def test_a_file_of_an_earlier_version_has_no_elements(tmp_path: Path) -> None:
 @pytest.mark.parametrize("key", ["plan", "state", "contacts", "error", "summary", "status", "sources"])
 def test_a_file_with_a_part_of_another_kind_is_refused(key: str, tmp_path: Path) -> None:
     path = changed(tmp_path / "run.nc", lambda run: run.update({key: 7}))
-    with pytest.raises(fs.InputError, match="cannot be read as a run"):
-        fs.load(path)
+    refuses("cannot be read as a run", fs.load, path)
 
 
 def test_several_fingers_are_a_dimension() -> None:
@@ -231,5 +225,4 @@ def test_a_dataframe_has_one_row_a_time() -> None:
     assert len(frame) == run.to_xarray().sizes["time"]
     assert len(run.to_dataframe(jumps="both")) == run.t.size
     assert {"f_el:Xfirm.Xgap", "f_el:Xlight.Xgap"} <= set(one("two_fingers").to_dataframe().columns)
-    with pytest.raises(fs.InputError, match="jumps is 'left'"):
-        run.to_dataframe(jumps="left")
+    refuses("jumps is 'left'", run.to_dataframe, jumps="left")

@@ -15,8 +15,6 @@ from fingerspice.solve.problem import Tables, prepare
 from fingerspice.solve.runs import integrate
 from scenes import CIRCUITS, by_turns, cases, every_law, table1
 
-# Orders -----------------------------------------------------------------------------------------------------
-
 # Fast enough that a step long against a period is short against the decays, and the gap voltage never changes sign.
 F = 20e3
 PHASES = 0.1 + 2.0 * math.pi * np.arange(16) / 16
@@ -70,8 +68,6 @@ def test_the_end_of_a_step_converges_faster_than_its_inside(law: str) -> None:
     assert np.all(e[:, 0] < 1e-3 * e[:, 1])
 
 
-# What a result depends on -----------------------------------------------------------------------------------
-
 SOURCES = {
     "sine": fs.Sine(200.0, 100.0),
     "square": fs.Square(180.0, 100.0, duty=0.3),
@@ -82,9 +78,6 @@ SOURCES = {
 
 def run(source: fs.Waveform, law: str, **options: Any) -> fs.Solution:
     return fs.simulate(table1(), **{"sources": {"Vdrive": source}, "charge_law": law, "t_stop": 0.02} | options)
-
-
-# Places it must not miss ------------------------------------------------------------------------------------
 
 
 @every_law
@@ -116,9 +109,6 @@ def test_no_step_is_longer_than_the_decks_tmax(longest: float) -> None:
     assert bound.stats["steps"] >= 0.02 / longest
     assert bound.stats["steps"] <= 1.2 * 0.02 / longest + 20
     assert np.abs(bound.u_gap - free.u_gap).max() <= 2e-6 * 50.0
-
-
-# Against another method -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("r_coat", "law"), by_turns(["1e-6", "1e-3", "1", "1k", "1e9", "1e15", "inf"]))
@@ -184,9 +174,6 @@ def test_only_a_charge_that_was_followed_step_by_step_has_an_error_stated() -> N
     assert fs.simulate(circuit, start="periodic", **given).error.q_source is None
 
 
-# Going on ---------------------------------------------------------------------------------------------------
-
-
 # Between jumps of the square, and at either of them.
 CUTS = [("sine", 0.0063), ("square", 0.0063), ("square", 0.01), ("square", 0.013), ("AM", 0.01), ("function", 0.013)]
 
@@ -223,8 +210,6 @@ def test_a_gap_voltage_at_the_end_of_the_areas_curve_is_not_crept_up_to() -> Non
     run = fs.simulate(circuit, t_stop=5e-3, rtol=1e-11, charge_law="mobile")
     assert run.stats["steps"] + run.stats["rejected"] < 3000
 
-
-# Against the independent reference --------------------------------------------------------------------------
 
 CHIRP_T = 0.01
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import warnings
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import analytic as ref
 import fingerspice as fs
 from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import AcSweep, Tran
-from scenes import DECKS, listed
+from scenes import DECKS, heard, listed, refuses, warns
 
 
 def read(*changes: tuple[str, str]) -> fs.Circuit:
@@ -19,18 +18,12 @@ def read(*changes: tuple[str, str]) -> fs.Circuit:
 
 
 def refusal(text: str) -> str:
-    with pytest.raises(fs.InputError) as caught:
-        fs.parse_netlist(text, "deck.cir")
-    return str(caught.value)
+    return refuses("", fs.parse_netlist, text, "deck.cir")
 
 
 def warned(text: str) -> list[str]:
     """The reader's warnings; they are also in the circuit."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        circuit = fs.parse_netlist(text, "deck.cir")
-    assert all(w.category is fs.FingerspiceWarning for w in caught)
-    said = [str(w.message) for w in caught]
+    circuit, said = heard(fs.parse_netlist, text, "deck.cir")
     assert said == list(circuit.warnings)
     return said
 
@@ -195,10 +188,8 @@ def test_values_are_changed_by_numbers_and_in_spices_notation(path: str, text: o
 
 
 def test_what_is_doubtful_in_a_sources_text_is_warned_about() -> None:
-    with pytest.warns(fs.FingerspiceWarning, match=r"'SIN\(0,5 200 100\)': 0,5 is two numbers, 0 and 5"):
-        read().replace({"Vdrive": "SIN(0,5 200 100)"})
-    with pytest.warns(fs.FingerspiceWarning, match=r"'SIN\(0 5\)': source: SIN leaves out FREQ"):
-        read().replace({"Vdrive": "SIN(0 5)"})
+    warns(r"'SIN\(0,5 200 100\)': 0,5 is two numbers, 0 and 5", read().replace, {"Vdrive": "SIN(0,5 200 100)"})
+    warns(r"'SIN\(0 5\)': source: SIN leaves out FREQ", read().replace, {"Vdrive": "SIN(0 5)"})
     with pytest.raises(fs.InputError, match=r"frequency is 0 Hz; allowed: > 0; note 0,1k is two numbers, 0 and 1k"):
         read().replace({"Vdrive": "SIN(0 5 0,1k)"})
 
@@ -229,17 +220,14 @@ def test_changes_that_are_no_values_are_one_sentence(path: str, text: object, sa
 
 @pytest.mark.parametrize("given", [None, 5, ("deck.cir",), np.zeros(2)])
 def test_what_is_no_path_and_no_text_is_one_sentence(given: object) -> None:
-    with pytest.raises(fs.InputError, match=r"read_netlist is given .*; allowed: the path of a netlist"):
-        fs.read_netlist(given)  # type: ignore[arg-type]
-    with pytest.raises(fs.InputError, match=r"parse_netlist is given .*; allowed: a netlist's text"):
-        fs.parse_netlist(given)  # type: ignore[arg-type]
+    refuses(r"read_netlist is given .*; allowed: the path of a netlist", fs.read_netlist, given)
+    refuses(r"parse_netlist is given .*; allowed: a netlist's text", fs.parse_netlist, given)
 
 
 def test_a_parameter_of_a_subcircuit_is_refused_with_the_elements_inside_it() -> None:
     circuit = fs.parse_netlist("t\nV1 a 0 5\n.subckt pair p n params: r=1k\nR1 p m {r}\nR2 m n 5\n.ends\nX1 a 0 pair\n")
     for path in ("X1.r", "x1.nothing", "X1"):
-        with pytest.raises(fs.InputError, match=r"is a subcircuit, whose own .* inside it \(X1\.R1, X1\.R2\)$"):
-            circuit.replace({path: 5})
+        refuses(r"is a subcircuit, whose own .* inside it \(X1\.R1, X1\.R2\)$", circuit.replace, {path: 5})
     assert circuit.replace({"X1.R1.value": 5})["X1.R1"].values["value"] == 5.0
 
 
@@ -250,13 +238,11 @@ def test_a_files_name_where_its_text_belongs_is_named() -> None:
 
 @pytest.mark.parametrize("changes", ["Xgap.d=3u", [("Xgap.d", 3e-6)], None, {5: 3e-6}])
 def test_changes_that_are_no_mapping_are_one_sentence(changes: object) -> None:
-    with pytest.raises(fs.InputError, match=r"allowed: a mapping such as \{'Xgap.d': 3e-6\}"):
-        read().replace(changes)  # type: ignore[arg-type]
+    refuses(r"allowed: a mapping such as \{'Xgap.d': 3e-6\}", read().replace, changes)
 
 
 def test_a_capital_m_in_a_change_is_milli_and_warned_about() -> None:
-    with pytest.warns(fs.FingerspiceWarning, match=r"Xcoat.R: '0.2M' is milli .* write 0.2meg"):
-        changed = read().replace({"Xcoat.R": "0.2M"})
+    changed = warns(r"Xcoat.R: '0.2M' is milli .* write 0.2meg", read().replace, {"Xcoat.R": "0.2M"})
     assert changed["Xcoat"].values["r"] == 2e-4
 
 

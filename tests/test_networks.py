@@ -13,8 +13,6 @@ from network_errors import Beside
 from network_reference import Floating, Tone, deck_of, random_network
 from scenes import COAT, DECKS, GAP, assignments, by_turns, cases, deck, every_law, finger, floating, shipped
 
-# Linear networks ---------------------------------------------------------------------------------------------
-
 
 @pytest.mark.filterwarnings("ignore:.* has no effect here")
 @pytest.mark.parametrize("seed", range(10))
@@ -41,9 +39,6 @@ def test_dividers_follow_at_once_and_give_back_their_charge() -> None:
     s = fs.simulate(deck("V1 a 0 SIN(0 10 1k)", "C1 a b 1n", "C2 b 0 3n", ".tran 1u 2m uic"))
     assert np.abs(s.node_voltages["b"] - 0.25 * s.node_voltages["a"]).max() <= 1e-12
     assert np.abs(s.q_source - 0.75e-9 * s.u_source).max() <= 1e-20
-
-
-# The same stack as a network ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -91,9 +86,6 @@ def test_a_dispersive_skin_in_a_network_is_the_same_ladder() -> None:
     assert np.abs(a.u_layer - b.u_layer).max() <= 3e-8 * np.abs(a.u_layer).max()
 
 
-# Mixed networks against an ODE written out by hand --------------------------------------------------------------
-
-
 @every_law
 @pytest.mark.parametrize("tau", [0.0, 50e-6])
 def test_amplifier_finger_and_body_follow_the_hand_written_equations(law: str, tau: float) -> None:
@@ -124,9 +116,6 @@ def test_an_ideal_jump_is_the_limit_of_a_fast_ramp(law: str) -> None:
     assert off[2] <= 3e-5
     assert 8.0 < off[0] / off[1] < 12.0
     assert 8.0 < off[1] / off[2] < 12.0
-
-
-# Energy ------------------------------------------------------------------------------------------------------
 
 
 def quadrature(start: float, stop: float, pieces: int) -> tuple[np.ndarray, np.ndarray]:
@@ -236,9 +225,6 @@ def agreeing(circuit: fs.Circuit, **options: object) -> tuple[fs.Solution, fs.So
     return s, exact
 
 
-# Kinetics ----------------------------------------------------------------------------------------------------
-
-
 @every_law
 def test_a_fast_area_returns_the_algebraic_law(law: str) -> None:
     def run(tau: float) -> np.ndarray:
@@ -281,9 +267,6 @@ def test_a_resistor_in_the_way_takes_the_fold_away() -> None:
     s, _ = agreeing(behind, charge_law="mobile")
     assert s.t[-1] == 0.9e-3
     assert s.fold_margin.min() > 0.9
-
-
-# Starting, going on, refusing ----------------------------------------------------------------------------------
 
 
 @every_law

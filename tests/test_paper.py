@@ -14,7 +14,7 @@ from fingerspice.circuit.statespace import build_stack
 from fingerspice.studies import figures
 from fingerspice.studies.figures import table1_circuit
 from fingerspice.studies.steady import steady_state
-from scenes import dispersive_deck, table1
+from scenes import dispersive_deck, refuses, table1, warns
 
 
 @functools.cache
@@ -127,8 +127,7 @@ def test_peak_gap_voltage_of_the_mobile_law_against_the_local(source, f, share):
 
 
 def test_dc_divides_by_the_resistances():
-    with pytest.warns(fs.FingerspiceWarning, match="outside 10 Hz to 100 kHz"):
-        circuit = table1("DC 1", 1.0)
+    circuit = warns("outside 10 Hz to 100 kHz", table1, "DC 1", 1.0)
     solution = fs.simulate(circuit, start="dc", t_stop=1e-3)
     assert solution.u_gap[-1] == pytest.approx(0.49, abs=5e-3)
     assert fs.simulate(table1("DC 1", 10.0), start="dc", t_stop=1e-3).u_gap[-1] == pytest.approx(0.56, abs=5e-3)
@@ -187,8 +186,7 @@ def test_every_figure_is_a_picture_with_its_data(folder: Path) -> None:
 def test_one_figure_can_be_asked_for_and_one_the_model_does_not_make_is_refused_first(tmp_path: Path) -> None:
     assert [p.name for p in figures.make_figures(tmp_path, only=2)] == ["fig2.png", "fig2.csv"]
     assert len(list(tmp_path.iterdir())) == 2
-    with pytest.raises(fs.InputError, match=r"figure is 1; allowed: 2, 3, 4, 5"):
-        figures.make_figures(tmp_path / "out", only=[2, 1])
+    refuses(r"figure is 1; allowed: 2, 3, 4, 5", figures.make_figures, tmp_path / "out", only=[2, 1])
     assert not (tmp_path / "out").exists()
 
 

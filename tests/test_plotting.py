@@ -9,7 +9,6 @@ import math
 import os
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from PIL import Image
 
 import fingerspice as fs
 from fingerspice.plots import drawing, traces
-from scenes import deck, listed, shipped, table1
+from scenes import deck, listed, quietly, refuses, shipped, table1, warns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,9 +45,7 @@ def small_print(figure: Figure) -> str:
 
 def with_source(value: fs.Waveform, **options: object) -> fs.Solution:
     """A run of Table 1 under `value`, whatever comes of it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        return fs.simulate(table1(), sources={"Vdrive": value}, throw=False, **options)  # type: ignore[arg-type]
+    return quietly(fs.simulate, table1(), sources={"Vdrive": value}, throw=False, **options)
 
 
 @pytest.fixture(scope="module")
@@ -138,8 +135,7 @@ def test_lines_are_within_their_frames(tmp_path: Path) -> None:
 
 def test_a_sweep_shows_gain_phase_force_and_area() -> None:
     circuit = table1()
-    with pytest.warns(fs.FingerspiceWarning, match="the sweep goes down to 1 Hz"):
-        result = fs.phasor(circuit, np.geomspace(1.0, 1e4, 21))
+    result = warns("the sweep goes down to 1 Hz", fs.phasor, circuit, np.geomspace(1.0, 1e4, 21))
     figure = traces.plot_phasor((result,), circuit)
     assert len(labels(figure)) == 4
     assert all(ax.get_xscale() == "log" for ax in figure.axes)
@@ -186,8 +182,7 @@ def test_a_picture_has_150_dots_an_inch_or_more_and_a_folder_that_can_be_written
         assert image.format == "PNG"
         assert image.width >= 150 * figure.get_size_inches()[0]
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["run.png"]
-    with pytest.raises(fs.InputError, match="cannot write"):
-        drawing.save(figure, tmp_path / "new" / "run.png" / "run.png")
+    refuses("cannot write", drawing.save, figure, tmp_path / "new" / "run.png" / "run.png")
 
 
 def test_thinning_keeps_every_extreme_and_both_ends() -> None:
@@ -238,8 +233,7 @@ def test_signals_that_are_asked_for_share_a_panel_with_their_like(sine: fs.Solut
     ],
 )
 def test_what_a_picture_refuses(sine: fs.Solution, options: dict[str, Any], said: str) -> None:
-    with pytest.raises(fs.InputError, match=said):
-        sine.plot(**options)
+    refuses(said, sine.plot, **options)
 
 
 def test_a_window_is_what_is_shown(sine: fs.Solution) -> None:
@@ -317,15 +311,11 @@ def test_an_envelope_is_smooth_where_oscillations_are_longer_than_most_and_falls
     assert upper[(t % 10.0 > 0.5) & (t % 10.0 < 1.5)].min() > 199.0
 
 
-# Pictures show themselves
-
-
 def test_a_picture_shows_itself_in_a_notebook_and_without_a_window_says_what_to_do(sine: fs.Solution) -> None:
     content, size = sine.plot()._repr_png_()
     with Image.open(io.BytesIO(content)) as image:
         assert image.width == 2 * size["width"] == 1400
-    with pytest.raises(fs.InputError, match=r"no window can be opened here .*; allowed: savefig"):
-        sine.plot().show()
+    refuses(r"no window can be opened here .*; allowed: savefig", sine.plot().show)
 
 
 WINDOW = """

@@ -1,8 +1,6 @@
 """A user's function as a source: declared breaks are exact, undeclared ones are found and warned about."""
 
 import math
-import warnings
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from hypothesis import strategies as st
 import fingerspice as fs
 from fingerspice.waveforms import sampling
 from fingerspice.waveforms.sampling import SourceTable, source_table
-from scenes import cases, table1, table1_deck
+from scenes import cases, heard, refuses, table1, table1_deck
 from waveform_cases import compiled
 
 STEP = 1e-5
@@ -22,14 +20,6 @@ WITHOUT_TRAN = table1_deck(tran="1u 1m").replace(".tran 1u 1m\n", "")
 
 def read(table: SourceTable, t: np.ndarray) -> np.ndarray:
     return compiled(table, t)[:, 0]
-
-
-def told(call, *given, **named) -> tuple[Any, list[str]]:
-    """What a call returns, and what it warns of."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        found = call(*given, **named)
-    return found, [str(w.message) for w in caught]
 
 
 class Counted:
@@ -51,9 +41,6 @@ def step_at(time: float):
 def spike_at(time: float, width: float):
     """A bell of that full width at half maximum, on a slow sine."""
     return lambda t: 100.0 * 0.5 ** (2.0 * (t - time) / width) ** 2 + 50.0 * np.sin(2.0 * math.pi * 100.0 * t)
-
-
-# Smooth functions -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -96,8 +83,7 @@ def test_a_function_that_misreads_arrays_without_raising_is_called_with_numbers(
     "given", ["a", None, [1.0, 2.0], 1j, np.array([1j, 2j]), True, np.ma.masked, np.datetime64("2026")]
 )
 def test_a_function_that_returns_no_number_is_refused_with_what_it_returned_and_its_time(given: object) -> None:
-    with pytest.raises(fs.InputError, match=r"the source function returned .* allowed: one number"):
-        fs.Function(lambda t: given).value([0.001, 0.002])
+    refuses(r"the source function returned .* allowed: one number", fs.Function(lambda t: given).value, [0.001, 0.002])
     with pytest.raises(fs.InputError, match=r"the source function returned .* at t = 0\.002 s; allowed: one number"):
         fs.Function(lambda t: given).value(0.002)
 
@@ -151,9 +137,6 @@ def test_precision_is_that_of_the_coarsest_part() -> None:
     assert fs.Function(lambda t: t).precision == fs.Sine(1.0, 1.0).precision == 2.0**-52
 
 
-# Declared breaks --------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=cases(25, 8), derandomize=True, deadline=None)
 @given(time=st.floats(1e-4, 0.0199))
 def test_a_declared_jump_is_an_edge_of_the_table_with_both_sides_right(time: float) -> None:
@@ -187,12 +170,9 @@ def test_the_sides_of_a_break_do_not_depend_on_the_rounding_of_the_function() ->
         assert one.spectrum(key).amplitude == pytest.approx(other.spectrum(key).amplitude, rel=0, abs=1e-7)
 
 
-# Undeclared jumps and spikes --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("time", [0.0123456789, 0.0031, 0.012, 0.01234])
 def test_an_undeclared_jump_is_found_and_warned_about_with_its_time_and_size(time: float) -> None:
-    table, (message,) = told(source_table, fs.Function(step_at(time)), 0.0, 0.02, TOL, STEP)
+    table, (message,) = heard(source_table, fs.Function(step_at(time)), 0.0, 0.02, TOL, STEP)
     assert "jumps by 150 V" in message
     assert f"at t = {time:.9g} s" in message
     assert "breaks=" in message
@@ -205,7 +185,7 @@ def test_several_undeclared_jumps_are_counted_in_one_warning() -> None:
     def square(t):
         return np.where(np.floor((t - 0.000123) / 0.005) % 2.0 == 0.0, 200.0, -200.0)
 
-    _, (message,) = told(source_table, fs.Function(square), 0.0, 0.02, TOL, STEP)
+    _, (message,) = heard(source_table, fs.Function(square), 0.0, 0.02, TOL, STEP)
     assert "at t = 0.000123 s and 3 more times" in message
 
 
@@ -213,7 +193,7 @@ def test_several_undeclared_jumps_are_counted_in_one_warning() -> None:
 @pytest.mark.parametrize("time", [0.0020037, 0.0123456, 0.0179911])
 def test_a_spike_narrower_than_the_step_is_resolved_and_warned_about_with_its_time(width: float, time: float) -> None:
     wave = fs.Function(spike_at(time, width * STEP))
-    table, (message,) = told(source_table, wave, 0.0, 0.02, TOL, STEP)
+    table, (message,) = heard(source_table, wave, 0.0, 0.02, TOL, STEP)
     assert "narrower than the output step 1e-05 s" in message
     seen = float(message.partition("near t = ")[2].partition(" s")[0])
     assert seen == pytest.approx(time, abs=2.0 * STEP)
@@ -225,7 +205,7 @@ def test_a_spike_narrower_than_the_step_is_resolved_and_warned_about_with_its_ti
 @given(time=st.floats(1e-4, 0.0015))
 def test_a_rectangular_pulse_of_half_a_step_is_never_missed(time: float) -> None:
     wave = fs.Function(lambda t: np.where((t >= time) & (t < time + 0.5 * STEP), 100.0, 0.0) + 10.0)
-    table, said = told(source_table, wave, 0.0, 0.002, TOL, STEP)
+    table, said = heard(source_table, wave, 0.0, 0.002, TOL, STEP)
     assert said
     t = time + np.array([-0.3, 0.1, 0.25, 0.4, 0.8]) * STEP
     np.testing.assert_allclose(read(table, t), wave.value(t), rtol=0, atol=1e-7)
@@ -238,9 +218,6 @@ def test_a_function_known_only_to_the_rounding_of_its_phase_costs_no_more_for_it
     assert sine.values < 200_000, "refining noise"
     t = np.linspace(1.0, 1.01, 500)[:-1]
     np.testing.assert_allclose(read(table, t), sine(t), rtol=0, atol=200.0 * 2e-11)
-
-
-# What is not finite -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -273,9 +250,6 @@ def test_a_function_that_fades_below_the_smallest_numbers_is_not_followed_there(
     assert fading.calls < 2_000_000
 
 
-# Noise ------------------------------------------------------------------------------------------------------
-
-
 DICE = np.random.default_rng(5)
 
 
@@ -295,8 +269,7 @@ def test_noise_is_refused_with_what_it_gave_twice_at_one_time(noise) -> None:
 @pytest.mark.parametrize("run", [fs.simulate, lambda c, sources: fs.steady_state(c.replace(sources))])
 def test_noise_as_a_source_is_refused_at_once(run) -> None:
     noise = fs.Function(lambda t: DICE.random(), repeat=0.01)
-    with pytest.raises(fs.InputError, match="allowed: the same value at the same time"):
-        run(table1(), sources={"Vdrive": noise})
+    refuses("allowed: the same value at the same time", run, table1(), sources={"Vdrive": noise})
 
 
 def test_a_function_that_never_becomes_smooth_is_refused_after_a_bounded_number_of_calls(monkeypatch):
@@ -328,7 +301,7 @@ def test_a_pulse_of_a_tenth_of_a_step_is_found_in_a_run_of_a_thousand_steps(shap
     length = 10.0**length
     step = length / 1000.0
     wave = fs.Function(lambda t: 50.0 * np.sin(40.0 * t / length) + shape(at * length, 0.1 * step)(t))
-    table, said = told(source_table, wave, 0.0, length, TOL, step, shortest=length / 2e4)
+    table, said = heard(source_table, wave, 0.0, length, TOL, step, shortest=length / 2e4)
     assert said
     t = at * length + np.array([-0.05, 0.02, 0.05, 0.08, 0.2]) * step
     np.testing.assert_allclose(read(table, t), wave.value(t), rtol=0, atol=1e-5)
@@ -337,7 +310,7 @@ def test_a_pulse_of_a_tenth_of_a_step_is_found_in_a_run_of_a_thousand_steps(shap
 def test_a_run_meets_the_pulse_of_a_function_and_plan_and_warning_say_what_it_would_miss() -> None:
     circuit = fs.parse_netlist(WITHOUT_TRAN)
     pulse = rectangle(3.21, 2e-3)
-    run, said = told(fs.simulate, circuit, sources=lambda t: pulse(t) + 1.0, t_stop=20.0, rtol=1e-3)
+    run, said = heard(fs.simulate, circuit, sources=lambda t: pulse(t) + 1.0, t_stop=20.0, rtol=1e-3)
     assert any("the source function jumps by 100 V at t = 3.21" in text for text in said)
     exact = fs.simulate(circuit, sources=fs.Pulse(1.0, 101.0, 3.21, width=2e-3), t_stop=20.0, rtol=1e-6)
     assert run.summary()["u_gap_max"] == pytest.approx(exact.summary()["u_gap_max"], rel=2e-3)
@@ -352,7 +325,7 @@ def test_nothing_is_said_of_events_where_the_run_is_short_or_the_edges_are_decla
         (lambda t: 100.0 * np.sin(600.0 * t), 0.05),
         (fs.Function(lambda t: 1.0 + 0.0 * t, (0.1,)), 20.0),
     ):
-        _, said = told(fs.simulate, circuit, sources=wave, t_stop=stop, rtol=1e-3)
+        _, said = heard(fs.simulate, circuit, sources=wave, t_stop=stop, rtol=1e-3)
         assert not any("looked at" in text for text in said)
 
 

@@ -17,7 +17,7 @@ from commands import Command
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.scene import EXAMPLES
 from fingerspice.sets import DATA, ELEMENTS, KINDS, WAVEFORMS, keys_in, references, tables
-from scenes import listed, shipped
+from scenes import listed, refuses, shipped
 
 ROOT = Path(__file__).parents[1]
 CIRCUITS = ROOT / "circuits"
@@ -223,8 +223,7 @@ def test_a_thick_glass_takes_nearly_all_of_the_voltage(pad: fs.Circuit) -> None:
 
 
 def test_two_fingers_may_differ() -> None:
-    two = shipped("two_fingers")
-    both = fs.parameters("moist").apply(two)
+    both = fs.parameters("moist").apply(shipped("two_fingers"))
     assert [both[name].values["r"] for name in ("Xfirm.Xgap", "Xlight.Xgap")] == [1e5, 1e5]
     made = fs.parameters("dry").apply(both, to="xlight")
     assert [made[name].values["r"] for name in ("Xfirm.Xgap", "Xlight.Xgap")] == [1e5, 7e6]
@@ -244,8 +243,7 @@ def test_a_dispersive_skin_has_no_f_and_takes_its_thickness() -> None:
 
 @pytest.mark.parametrize(("given", "said"), listed("sets"))
 def test_an_unknown_set_or_one_of_another_kind_is_refused_with_what_is_allowed(given: tuple, said: str) -> None:
-    with pytest.raises(fs.InputError, match=re.escape(said)):
-        fs.parameters(*given)
+    refuses(re.escape(said), fs.parameters, *given)
 
 
 BARE = "t\nV1 a 0 SIN(0 10 100)\nXgap a 0 area GAP\n.tran 1m 20m uic\n"
@@ -267,10 +265,8 @@ DRIVEN = "t\nV1 a b SIN(0 9 100)\nV2 b 0 SIN(0 9 50)\nXgap a 0 area GAP r=1meg\n
 )
 def test_a_circuit_without_a_place_for_the_set_is_refused(deck: str, name: str, to: str | None, said: str) -> None:
     circuit = fs.parse_netlist(deck)
-    with pytest.raises(fs.InputError, match=re.escape(said)):
-        fs.parameters(name).apply(circuit, to)
-    with pytest.raises(fs.InputError, match="the circuit is a str; allowed: a Circuit"):
-        with_set(name, deck)  # type: ignore[arg-type]
+    refuses(re.escape(said), fs.parameters(name).apply, circuit, to)
+    refuses("the circuit is a str; allowed: a Circuit", with_set, name, deck)
 
 
 def test_the_layer_or_source_may_be_named() -> None:

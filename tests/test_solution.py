@@ -18,7 +18,7 @@ import fingerspice as fs
 from commands import tree
 from fingerspice.base.files import write_aside
 from fingerspice.results.record import SIGNALS
-from scenes import deck, shipped, table1
+from scenes import deck, refuses, shipped, table1
 
 SQUARE = "SQUARE(200 100)"
 T_STOP, STEP = 0.03, 1e-4
@@ -72,9 +72,6 @@ def test_with_t_eval_times_are_exactly_those_and_right_hand_at_jumps() -> None:
     np.testing.assert_array_equal(solution.t, asked)
     np.testing.assert_array_equal(solution.u_source, [200.0, 200.0, -200.0, 200.0, -200.0, 200.0])
     assert solution.u_layer.shape == (6, 3)
-
-
-# Two rows at a jump, left and right, and none at the corners of a finite edge
 
 
 def under(source: fs.Waveform, stop: float, step: float, **more: Any) -> fs.Solution:
@@ -217,11 +214,9 @@ def test_netcdf_holds_what_to_xarray_gives(square: fs.Solution, tmp_path: Path) 
 
 
 def test_another_word_for_jumps_is_refused(square: fs.Solution, tmp_path: Path) -> None:
-    with pytest.raises(fs.InputError, match=r"jumps is 'right'; allowed: 'both' or 'none'"):
-        fs.simulate(table1(), jumps="right")
+    refuses(r"jumps is 'right'; allowed: 'both' or 'none'", fs.simulate, table1(), jumps="right")
     for call in (square.to_xarray, square.to_dataframe, lambda **k: square.to_netcdf(tmp_path / "x.nc", **k)):
-        with pytest.raises(fs.InputError, match=r"jumps is 'left'; allowed: 'right' or 'both'"):
-            call(jumps="left")
+        refuses(r"jumps is 'left'; allowed: 'right' or 'both'", call, jumps="left")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -4,7 +4,6 @@ import itertools
 import os
 import struct
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.netlist import reader
 from fingerspice.waveforms import files
-from scenes import listed, table1_deck
+from scenes import listed, refuses, table1_deck
 
 GUID = bytes.fromhex("800000aa00389b71")
 
@@ -68,13 +67,6 @@ def packed(values: np.ndarray, width: int = 2) -> bytes:
     if width == 1:
         return bytes((values + 128).astype(np.uint8))
     return b"".join(int(v).to_bytes(width, "little", signed=True) for v in values)
-
-
-def refusal(call: Callable[..., object], *given: Any, **named: Any) -> str:
-    with pytest.raises(fs.InputError) as caught:
-        call(*given, **named)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def read_both_ways(path: Path, channel: int | None = None) -> tuple[object, object]:
@@ -219,10 +211,10 @@ def test_channels_and_gains_that_cannot_be_are_refused(at_once: bool, in_folder:
         ("b.wav", float("nan"), None, "gain is nan; allowed: a finite number of V at full scale"),
         ("a.wav", "150", 0, "gain is '150'; allowed: a finite number of V at full scale"),
     ):
-        assert refusal(fs.Samples.from_wav, name, gain, channel, at_once=at_once) == said
+        assert refuses("", fs.Samples.from_wav, name, gain, channel, at_once=at_once) == said
     # A gain beyond the range is refused by the samples that it makes too large.
     Path("c.wav").write_bytes(wav(packed(np.full(9, 2**14))))
-    said = refusal(fs.Samples.from_wav, "c.wav", 3e12, at_once=at_once)
+    said = refuses("", fs.Samples.from_wav, "c.wav", 3e12, at_once=at_once)
     assert said == "'c.wav': a sample is 1.5e+12 V; allowed: a size up to 1e+12"
     Path("c.wav").write_bytes(wav(bytes(18)))
     assert fs.Samples.from_wav("c.wav", 3e12, at_once=at_once).peak(0.0, 1.0) == 0.0
@@ -233,25 +225,25 @@ def test_files_beyond_the_limits_are_refused_unread(in_folder: None, monkeypatch
         with Path(name).open("wb") as file:
             file.truncate(size)
     said = "'a.wav' has 4,768 MiB; allowed: at most 1,024 MiB"
-    assert refusal(fs.Samples.from_wav, "a.wav", 1.0) == refusal(fs.PWL.from_table, "a.wav") == said
-    assert refusal(fs.PWL.from_table, "a.csv") == "'a.csv' has 95 MiB; allowed: at most 64 MiB"
+    assert refuses("", fs.Samples.from_wav, "a.wav", 1.0) == refuses("", fs.PWL.from_table, "a.wav") == said
+    assert refuses("", fs.PWL.from_table, "a.csv") == "'a.csv' has 95 MiB; allowed: at most 64 MiB"
     monkeypatch.setattr(files, "MAX_SAMPLES", 30)
     Path("b.wav").write_bytes(MONO)
-    assert refusal(fs.Samples.from_wav, "b.wav", 1.0) == "'b.wav' has 40 samples; allowed: at most 30"
-    assert "640 samples; allowed: at most 30" in refusal(fs.Samples(np.arange(40), 1.0).upsampled)
+    assert refuses("", fs.Samples.from_wav, "b.wav", 1.0) == "'b.wav' has 40 samples; allowed: at most 30"
+    assert "640 samples; allowed: at most 30" in refuses("", fs.Samples(np.arange(40), 1.0).upsampled)
     Path("c.csv").write_text("".join(f"{i} 0\n" for i in range(40)))
-    assert refusal(fs.PWL.from_table, "c.csv") == "'c.csv' has 40 samples; allowed: at most 30"
+    assert refuses("", fs.PWL.from_table, "c.csv") == "'c.csv' has 40 samples; allowed: at most 30"
     np.savez_compressed("d.npz", t=np.zeros(400))
-    assert "unpacks to" in refusal(fs.PWL.from_table, "d.npz")
+    assert "unpacks to" in refuses("", fs.PWL.from_table, "d.npz")
 
 
 def test_what_is_no_file_is_refused(in_folder: None) -> None:
     Path("folder").mkdir()
     os.mkfifo("pipe")
-    assert refusal(fs.Samples.from_wav, "folder", 1.0) == "'folder' is a folder, not a file"
-    assert refusal(fs.Samples.from_wav, "no.wav", 1.0) == "'no.wav' does not exist"
-    assert refusal(fs.PWL.from_table, "a\0b") == "'a\\x00b' does not exist"
-    assert refusal(fs.PWL.from_table, "pipe") == "'pipe' is not an ordinary file"
+    assert refuses("", fs.Samples.from_wav, "folder", 1.0) == "'folder' is a folder, not a file"
+    assert refuses("", fs.Samples.from_wav, "no.wav", 1.0) == "'no.wav' does not exist"
+    assert refuses("", fs.PWL.from_table, "a\0b") == "'a\\x00b' does not exist"
+    assert refuses("", fs.PWL.from_table, "pipe") == "'pipe' is not an ordinary file"
 
 
 # Tables -------------------------------------------------------------------------------------------------------
@@ -291,7 +283,7 @@ def test_arrays_of_numpy_are_columns(tmp_path: Path) -> None:
     # Times that agree with the rate say no more than it does.
     np.savez(path, u=np.array([1.0, 3.0, -2.0]), t=np.arange(3) / 48000, rate=48000)
     assert fs.Samples.from_table(path).rate == 48000.0
-    assert "is a table with a rate; allowed: one with times" in refusal(fs.PWL.from_table, path)
+    assert "is a table with a rate; allowed: one with times" in refuses("", fs.PWL.from_table, path)
 
 
 MICRO = "t (\xb5s),drive (V)\n0,0\n1000,10\n2000,20\n3000,0\n".encode("latin-1")
@@ -324,15 +316,15 @@ def test_a_file_of_a_pwl_alternates_times_and_values(text: str, folder: Path) ->
     assert fs.PWL.from_table("decks/line.txt", pairs=True) == points
     Path("decks/line.txt").write_text(text.replace("10", "", 1).replace("\n\n", "\n").replace(" , ", " "))
     said = "'decks/line.txt' holds 7 numbers; allowed: pairs of time and value"
-    assert said in refusal(source, "PWL FILE=line.txt")
+    assert said in refuses("", source, "PWL FILE=line.txt")
     Path("decks/line.txt").write_text(text.replace("2m", "0.5m"))
-    assert "the time 0.0005 s follows 0.001 s" in refusal(source, "PWL FILE=line.txt")
+    assert "the time 0.0005 s follows 0.001 s" in refuses("", source, "PWL FILE=line.txt")
 
 
 @pytest.mark.parametrize(("text", "given", "said"), listed("tables"), ids=[said for *_, said in listed("tables")])
 def test_what_is_no_table_is_refused_with_its_line(text, given, said, in_folder):
     Path("a.csv").write_text(text)
-    assert said in refusal(fs.PWL.from_table, "a.csv", **given)
+    assert said in refuses("", fs.PWL.from_table, "a.csv", **given)
 
 
 def test_rates_that_contradict_the_times_are_refused(in_folder: None) -> None:
@@ -349,7 +341,7 @@ def test_rates_that_contradict_the_times_are_refused(in_folder: None) -> None:
         ("a.npz", None, None, "row 2: the time 4.53515e-05 s is not that of sample 2 at 48000 Hz, 4.16667e-05 s"),
         ("a.npz", 44100.0, None, "the rate given is 44100 Hz, and its own is 48000 Hz; allowed: one rate"),
     ):
-        assert said in refusal(fs.Samples.from_table, name, rate, value)
+        assert said in refuses("", fs.Samples.from_table, name, rate, value)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +360,7 @@ def test_rates_that_contradict_the_times_are_refused(in_folder: None) -> None:
 )
 def test_arrays_that_are_no_columns_are_refused(arrays: dict[str, np.ndarray], said: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", **arrays)  # type: ignore[arg-type]
-    assert said in refusal(fs.PWL.from_table, tmp_path / "a.npz")
+    assert said in refuses("", fs.PWL.from_table, tmp_path / "a.npz")
 
 
 def test_a_broken_npz_is_refused(tmp_path: Path) -> None:
@@ -377,13 +369,10 @@ def test_a_broken_npz_is_refused(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for broken in (whole[:900], b"junk" + whole[4:900], b"time,voltage\n0,1\n"):
         path.write_bytes(broken)
-        assert "cannot be read as NPZ" in refusal(fs.PWL.from_table, path)
+        assert "cannot be read as NPZ" in refuses("", fs.PWL.from_table, path)
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("readme.txt", "no array")
-    assert "the array 'readme.txt' is of another kind; allowed: real numbers" in refusal(fs.PWL.from_table, path)
-
-
-# Band-limited -------------------------------------------------------------------------------------------------
+    assert "the array 'readme.txt' is of another kind; allowed: real numbers" in refuses("", fs.PWL.from_table, path)
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.45])
@@ -407,7 +396,7 @@ def test_an_upsampled_recording_is_held_at_its_ends() -> None:
     assert wave.values.size == 49 * 8 + 1
     assert wave.start == 0.2
     for factor in (1, 65, 2.5):
-        assert "allowed: 2 to 64, a whole number" in refusal(wave.upsampled, factor)
+        assert "allowed: 2 to 64, a whole number" in refuses("", wave.upsampled, factor)
 
 
 # In decks -----------------------------------------------------------------------------------------------------
@@ -478,7 +467,7 @@ def test_decks_name_files_beside_them(folder: Path) -> None:
 @pytest.mark.parametrize(("text", "said"), listed("files"), ids=[text for text, _ in listed("files")])
 def test_files_that_a_deck_may_not_or_cannot_read_are_refused_with_its_line(text: str, said: str, folder: Path) -> None:
     Path("decks/link.wav").symlink_to(folder / "outside.wav")
-    message = refusal(source, text)
+    message = refuses("", source, text)
     assert message.startswith("decks/pad.cir:3:")
     assert said in message
 
@@ -488,7 +477,7 @@ def test_all_files_of_a_deck_together_have_a_limit(folder: Path, monkeypatch: py
     twice = "Vother other 0 WAVEFILE(mono.wav 1)\nRother other 0 1k"
     source("WAVEFILE(mono.wav 150)")
     said = "decks/pad.cir:8:25: the sources' files are larger than"
-    assert said in refusal(source, "WAVEFILE(mono.wav 150)", twice)
+    assert said in refuses("", source, "WAVEFILE(mono.wav 150)", twice)
 
 
 # On the command line ------------------------------------------------------------------------------------------
@@ -504,8 +493,7 @@ def test_sources_of_the_command_line_are_named_from_the_working_directory(comman
     recording = "WAV(far/a.wav gain=150)"
     for spec in (recording, f"WAVEFILE({tmp_path}/far/a.wav 150)", "TABLE(far/a.csv)", "PWL FILE=far/a.csv"):
         words = ("run", "decks/no_end.cir", "--source", spec, "--stop", "20m", "--no-plot", "--overwrite", "--csv")
-        done = command(*words, "--start", "5m")
-        assert done.code == 0, done.err
+        command(*words, "--start", "5m").ok()
         t = np.loadtxt("out/no_end.csv", delimiter=",", skiprows=1)[:, 0]
         assert (t[0], t[-1]) == (0.005, 0.02)
         assert np.unique(t).size >= 1001
@@ -514,8 +502,7 @@ def test_sources_of_the_command_line_are_named_from_the_working_directory(comman
     assert ".tran 5e-06 0.005 uic" in exported
     # 8 samples a millisecond: up to the first beyond the end.
     assert exported[exported.index("PWL(") : exported.index(")", exported.index("PWL("))].count(" ") < 2 * 46
-    refused = command("run", "decks/no_end.cir", "--source", "WAV(far/b.wav gain=150)", "--stop", "20m")
-    assert refused.code == 2
+    refused = command("run", "decks/no_end.cir", "--source", "WAV(far/b.wav gain=150)", "--stop", "20m").refused()
     assert refused.err == "fingerspice: --source 'WAV(far/b.wav gain=150)': source: 'far/b.wav' does not exist\n"
     # A deck does not reach there.
     Path("decks/out.cir").write_text(deck.replace("SIN(0 200 100)", "WAVEFILE(../far/a.wav 150)"))

@@ -9,7 +9,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.results.spectrum import equivalent_segments, interval
-from scenes import deck, listed, table1
+from scenes import deck, listed, refuses, table1, warns
 
 RATE = 8000.0
 
@@ -127,15 +127,13 @@ def test_outputs_too_rare_for_the_force_are_told() -> None:
         fs.simulate(table1(), sources=fs.Chirp(100.0, 3e3, 3.001e3, 0.02), t_eval=np.arange(0.0, 0.02, h), rtol=1e-6)
         for h in (100e-6, 60e-6)
     )
-    with pytest.warns(fs.FingerspiceWarning, match=r"half the rate of the outputs, 5000 Hz.*shorter step"):
-        rare.spectrum()
+    warns(r"half the rate of the outputs, 5000 Hz.*shorter step", rare.spectrum)
     often.spectrum()
 
 
 def test_a_period_that_is_not_yet_periodic_is_told() -> None:
     circuit = deck("V1 a 0 SIN(5 1 100)", "R1 a b 1meg", "C1 b 0 100n", ".tran 100u 20m uic")
-    with pytest.warns(fs.FingerspiceWarning, match="start='periodic'"):
-        fs.simulate(circuit).spectrum("v:b")
+    warns("start='periodic'", fs.simulate(circuit).spectrum, "v:b")
     fs.simulate(circuit, start="periodic").spectrum("v:b")
 
 
@@ -148,31 +146,26 @@ def test_a_signal_that_jumps_at_the_end_of_its_period_is_periodic(jumps: str) ->
 
 @pytest.mark.parametrize(("options", "said"), [*listed("spectra"), ({"resolution": math.nan}, "a number of Hz, > 0")])
 def test_what_a_spectrum_refuses(sine: fs.Solution, options: dict[str, object], said: str) -> None:
-    with pytest.raises(fs.InputError, match=said):
-        sine.spectrum(**options)  # type: ignore[arg-type]
+    refuses(said, sine.spectrum, **options)
 
 
 def test_uneven_outputs_are_refused_with_the_remedy() -> None:
     solution = resistor(fs.PWL((0.0, 1.0), (0.0, 1.0)), 1.0, t_eval=np.linspace(0.0, 1.0, 500) ** 2)
-    with pytest.raises(fs.InputError, match=r"not evenly spaced.*\.tran line's step, or even times in t_eval"):
-        solution.spectrum("u_source")
-    with pytest.raises(fs.InputError, match="holds no whole period"):
-        solution.spectrum("u_source", method="lines")
+    refuses(r"not evenly spaced.*\.tran line's step, or even times in t_eval", solution.spectrum, "u_source")
+    refuses("holds no whole period", solution.spectrum, "u_source", method="lines")
 
 
 def test_two_fingers_have_a_spectrum_each() -> None:
     circuit = fs.read_netlist(Path(__file__).parents[1] / "circuits" / "two_fingers.cir")
     solution = fs.simulate(circuit, rtol=1e-6)
-    with pytest.raises(fs.InputError, match=r"2 columns.*f_t:Xfirm\.Xgap, f_t:Xlight\.Xgap"):
-        solution.spectrum()
+    refuses(r"2 columns.*f_t:Xfirm\.Xgap, f_t:Xlight\.Xgap", solution.spectrum)
     firm, light = (solution.spectrum(f"f_t:{name}") for name in solution.gaps)
     assert firm.shown_variance > light.shown_variance > 0.0
 
 
 def test_a_spectrum_is_read_only_and_shown_as_text_and_picture(sine: fs.Solution, noise: fs.Solution) -> None:
     lines = sine.spectrum()
-    with pytest.warns(fs.FingerspiceWarning, match="folded"):
-        density = noise.spectrum("u_source")
+    density = warns("folded", noise.spectrum, "u_source")
     for found in (lines, pickle.loads(pickle.dumps(lines))):
         assert not found.amplitude.flags.writeable
     assert "200 Hz" in str(lines)

@@ -17,8 +17,6 @@ from scenes import every_law, table1
 
 every_number = pytest.mark.parametrize("stages", [3, STAGES_BESIDE, STAGES])
 
-# Coefficients -----------------------------------------------------------------------------------------------
-
 
 def dense_weights(tableau: Scheme, theta: float) -> np.ndarray:
     return tableau.dense @ theta ** np.arange(1, tableau.dense.shape[1] + 1)
@@ -59,8 +57,6 @@ def test_the_method_damps_what_is_infinitely_stiff(stages: int) -> None:
     assert max(growth(1j * y) for y in np.logspace(-3, 6, 200)) <= 1.0 + 1e-12
     assert growth(-0.1) == pytest.approx(math.exp(-0.1), rel=1e-4 if stages < 5 else 1e-12)
 
-
-# Orders of the compiled step ----------------------------------------------------------------------------------
 
 # A sine from its phase of 25 degrees: the gap voltage is far from its kink over the longest step.
 F, U0, PHASE = 300.0, 100.0, 25.0

@@ -13,66 +13,24 @@ import analytic
 import fingerspice as fs
 from commands import Command
 from ngspice_tools import call_ngspice, run_ngspice
+from scenes import DECKS, listed, refuses, warns
 
-DECK = """steps of a gap
-.param gap=3.5u R={{2*gap/7u*1meg}} V=200
-.include fingerspice.lib
-V1 drive 0 SIN(0 {{V}} 100)
-Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg
-Xgap top skin area GAP d={{gap}} eps_r=1 r={{R}} fn=0.5
-Xskin skin 0 area SKIN d=350u f=100
-.tran {tstep} 50m uic
-{lines}
-.end
-"""
+DECK, TEMPERATURE = ((DECKS / f"{name}.cir").read_text() for name in ("steps", "temperature"))
 
 
 def deck(*lines: str, tstep: str = "100u") -> fs.Circuit:
     return fs.parse_netlist(DECK.format(lines="\n".join(lines), tstep=tstep))
 
 
-@pytest.mark.parametrize(
-    ("line", "values"),
-    [
-        ("param gap 3u 4u 0.5u", [3e-6, 3.5e-6, 4e-6]),
-        ("gap 3u 4u 0.4u", [3e-6, 3.4e-6, 3.8e-6]),
-        ("param gap list 1u 5u 2u", [1e-6, 5e-6, 2e-6]),
-        ("dec param gap 1u 100u 2", [1e-6, 10**0.5 * 1e-6, 1e-5, 10**1.5 * 1e-6, 1e-4]),
-        ("oct Xgap.r 1meg 4meg 1", [1e6, 2e6, 4e6]),
-        ("lin Xgap.d 4u 3u -0.5u", [4e-6, 3.5e-6, 3e-6]),
-        ("V1 0 {V} {V/4}", [0.0, 50.0, 100.0, 150.0, 200.0]),
-        ("Xgap.d list {gap} {2*gap}", [3.5e-6, 7e-6]),
-    ],
-)
+@pytest.mark.parametrize(("line", "values"), listed("forms_of_step"))
 def test_forms_of_step(line: str, values: list[float]) -> None:
     (step,) = deck(f".step {line}").steps
     np.testing.assert_allclose(step.values, values, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("lines", "said"),
-    [
-        ([".step param gop 1 2 1"], "did you mean 'gap'"),
-        ([".step Xgop.d 1 2 1"], "'Xgop.d' is not there"),
-        ([".step temp 0 1 1"], "the temperature is not stepped here"),
-        ([".step gap 1u 2u 0"], "has no values"),
-        ([".step gap 2u 1u 1u"], "has no values"),
-        ([".step gap list"], "list without values"),
-        ([".step dec gap 0 1 5"], "values above 0"),
-        ([".step gap 1u 2u 1p"], "1e+06 values; allowed: 100,000"),
-        ([".step gap 1u 2u 1n", ".step R 1k 2k 1"], "in all; allowed: 100,000"),
-        ([".step gap 1u 2u"], "increment"),
-        ([".step gap 1u 2u 1u 3u"], "'3u' is not understood"),
-        ([".step gap 1u 2u 1u"] * 2, "steps gap twice"),
-        ([f".step {p} list 1 2" for p in ("gap", "R", "V", "Xcoat.d")], "4 .step lines; allowed: three"),
-        ([".dc V1 0 1"], "increment"),
-        ([".dc"], "what is stepped"),
-        ([".dc V1 0 1 1"] * 2, ".dc is given twice"),
-    ],
-)
+@pytest.mark.parametrize(("lines", "said"), listed("bad_steps"))
 def test_bad_steps(lines: list[str], said: str) -> None:
-    with pytest.raises(fs.InputError, match=r"(?s).*" + said.replace("(", r"\(").replace("+", r"\+")):
-        deck(*lines)
+    refuses(r"(?s).*" + said.replace("(", r"\(").replace("+", r"\+"), deck, *lines)
 
 
 def test_steps_equal_single_runs() -> None:
@@ -140,18 +98,13 @@ def test_a_source_and_the_end_of_a_run_are_stepped() -> None:
 
 
 def test_refused_requests() -> None:
-    with pytest.raises(fs.InputError, match=r"no \.step line"):
-        fs.run_steps(deck())
-    with pytest.raises(fs.InputError, match="allowed: figures such as"):
-        fs.run_steps(deck(".step gap list 1u 2u"), outputs=("f_el_men",))
+    refuses(r"no \.step line", fs.run_steps, deck())
+    refuses("allowed: figures such as", fs.run_steps, deck(".step gap list 1u 2u"), outputs=("f_el_men",))
     with pytest.raises(fs.InputError, match="u_gap is the name of a step or measure"):
         fs.run_steps(deck(".step gap list 1u 2u", ".meas tran u_gap MAX V(top)"))
-    with pytest.raises(fs.InputError, match="fewer outputs or signals"):
-        fs.run_steps(deck(".step gap 1u 2u 0.1n", tstep="10n"))
-    with pytest.raises(fs.InputError, match="no step has a result; the first: gap = -1"):
-        fs.run_steps(deck(".step gap list -1 -2"))
-    with pytest.warns(fs.FingerspiceWarning, match=r"\.step has no effect in one run"):
-        fs.simulate(deck(".step gap list 1u 2u"), rtol=1e-4)
+    refuses("fewer outputs or signals", fs.run_steps, deck(".step gap 1u 2u 0.1n", tstep="10n"))
+    refuses("no step has a result; the first: gap = -1", fs.run_steps, deck(".step gap list -1 -2"))
+    warns(r"\.step has no effect in one run", fs.simulate, deck(".step gap list 1u 2u"), rtol=1e-4)
 
 
 def test_operating_points_against_their_equations() -> None:
@@ -193,16 +146,14 @@ def test_steps_side_by_side_in_ngspice() -> None:
     for name, ours in zip(names, found.values.reshape(4, -1), strict=True):
         other = np.interp(found.time, theirs["time"], theirs[name])
         assert np.abs(ours - other)[1:].max() <= 1e-6 * np.abs(ours).max()
-    with pytest.raises(fs.InputError, match="501 steps; allowed in an export: 200"):
-        fs.export_netlist(deck(".step gap 1u 6u 10n"))
+    refuses("501 steps; allowed in an export: 200", fs.export_netlist, deck(".step gap 1u 6u 10n"))
 
 
 def test_run_writes_steps_and_analyses(command: Command) -> None:
     """The command writes a family of curves, and what `.op`, `.dc` and `.ac` ask for; a bad step is a warning."""
     lines = (".step gap list 3u -1u 4u", ".op", ".dc V1 0 200 50", ".ac dec 5 10 10k", ".meas tran most MAX F_EL(Xgap)")
     Path("steps.cir").write_text(DECK.format(lines="\n".join(lines), tstep="100u"))
-    done = command("run", "steps.cir", "--json")
-    assert done.code == 0
+    done = command("run", "steps.cir", "--json").ok()
     answer = json.loads(done.out)
     assert [one["status"] for one in answer["steps"]] == ["one_by_one", "refused", "one_by_one"]
     assert answer["steps"][2]["figures"]["most"] > 0.1
@@ -222,8 +173,7 @@ def test_run_writes_steps_and_analyses(command: Command) -> None:
     with xarray.open_dataset("out/steps.nc", engine="h5netcdf") as kept:
         assert math.isnan(kept.most[1])
         assert kept.u_gap.dims == ("gap", "time")
-    again = command("run", "steps.cir", "--csv", "--no-plot")
-    assert again.code == 0
+    command("run", "steps.cir", "--csv", "--no-plot").ok()
     assert command("run", "steps.cir", "--csv", "--no-plot").code == 0
     assert Path("out/steps.csv").read_text().splitlines()[0] == (
         "gap,u_gap_rms [V],f_el_mean [N],f_t_mean [N],most,status"
@@ -234,9 +184,7 @@ def test_run_writes_steps_and_analyses(command: Command) -> None:
     assert [float(raw.vectors["gap"][run][0]) for run in raw.steps] == [3e-6, -1e-6, 4e-6]
     one = fs.simulate(deck().replace({"Xgap.d": 4e-6, "Xgap.r": 8e6 / 7.0}))
     np.testing.assert_allclose(raw.vectors["@xgap[u_gap]"][raw.steps[2]], one.u_gap, rtol=0.0, atol=1e-6)
-    refused = command("run", "steps.cir", "--feel")
-    assert refused.code == 2
-    assert "--feel goes with one run" in refused.err
+    command("run", "steps.cir", "--feel").refused("--feel goes with one run")
     assert ".step has no effect in one run" in command("plan", "steps.cir").err
 
 
@@ -283,24 +231,9 @@ def test_a_sweep_at_each_step_equals_its_closed_form(command: Command) -> None:
 
 def test_a_deck_without_tran(command: Command) -> None:
     Path("op.cir").write_text(DECK.format(lines=".op\n.dc V1 0 200 50", tstep="1u").replace(".tran 1u 50m uic\n", ""))
-    done = command("run", "op.cir")
-    assert done.code == 0
+    done = command("run", "op.cir").ok()
     assert "operating point" in done.out
     assert Path("out/op_dc.png").is_file()
-
-
-TEMPERATURE = """values that follow the temperature
-V1 a 0 1
-R1 a b RM 1k
-R2 b 0 2k tc1=1m tc2=10u
-R3 a c RM
-R4 c 0 1k tc1=5m
-C1 c 0 CM 1u
-.model RM R(tc1=2m tc2=-5u r=3k)
-.model CM C tc1=1m
-.temp 77
-.end
-"""
 
 
 def test_an_elements_name_alone_is_its_one_value() -> None:
@@ -330,19 +263,6 @@ def test_values_follow_the_temperature_as_in_ngspice(tmp_path: Path) -> None:
         assert again["R1"].values["value"] == pytest.approx(1e3 * warm, rel=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "said"),
-    [
-        (".temp 77", ".temp 77 99", "allowed: .temp 50"),
-        (".temp 77", ".options temp=warm", "allowed: a number, in °C"),
-        (".temp 77", ".temp -500", r":3:1: R1 is -1.443 times its value where it is -527 K warmer"),
-        ("RM 1k", "CM 1k", "R1 is of the model CM, which is of a C"),
-        ("RM 1k", "RX 1k", "R1 needs one value"),
-        ("R(tc1=2m", "R(tc3=2m", "R1 takes no parameter 'tc3'"),
-        ("RM R(", "RM D(", "is not supported; allowed: .model NAME SW"),
-        ("R3 a c RM", "R3 a c CX", "R3 value is 'CX'; allowed: a number ohm"),
-    ],
-)
+@pytest.mark.parametrize(("before", "after", "said"), listed("bad_temperatures"))
 def test_bad_temperatures_and_models(before: str, after: str, said: str) -> None:
-    with pytest.raises(fs.InputError, match=said):
-        fs.parse_netlist(TEMPERATURE.replace(before, after))
+    refuses(said, fs.parse_netlist, TEMPERATURE.replace(before, after))

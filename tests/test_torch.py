@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.base.errors import InputError
-from scenes import cases, listed, shipped, table1
+from scenes import cases, listed, refuses, shipped, table1
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install '.[test]'")
 
@@ -200,8 +199,7 @@ def test_no_warning_about_values_that_an_optimiser_chooses() -> None:
 
 @pytest.mark.parametrize(("arguments", "how", "text"), listed("simulators"))
 def test_refused_when_it_is_made(arguments: tuple[Any, ...], how: dict[str, Any], text: str) -> None:
-    with pytest.raises(InputError, match=text):
-        fs.torch.Simulator(table1(), *arguments, **how)
+    refuses(text, fs.torch.Simulator, table1(), *arguments, **how)
 
 
 @pytest.mark.parametrize(
@@ -213,33 +211,26 @@ def test_refused_when_it_is_made(arguments: tuple[Any, ...], how: dict[str, Any]
     ],
 )
 def test_refused_when_it_is_called(values: dict[str, Any], text: str) -> None:
-    with pytest.raises(InputError, match=text):
-        fs.torch.Simulator(table1(), (), t_stop=T_STOP)(values)
+    refuses(text, fs.torch.Simulator(table1(), (), t_stop=T_STOP), values)
 
 
 def test_the_scene_that_cannot_be_run_is_named() -> None:
     simulator = fs.torch.Simulator(table1(), {"Xgap.mu": [0.3, 50.0]}, "u_gap", t=TIMES, t_stop=T_STOP)
-    with pytest.raises(InputError, match=r"scene 1: .*no contact"):
-        simulator()
+    refuses(r"scene 1: .*no contact", simulator)
     zero = fs.torch.Simulator(table1(), ("Vdrive.offset",), t_stop=T_STOP)
-    with pytest.raises(InputError, match=r"scene 0: .*Vdrive.offset, which is 0; allowed"):
-        zero().backward()
+    refuses(r"scene 0: .*Vdrive.offset, which is 0; allowed", zero().backward)
 
 
 def test_second_derivatives_are_refused(means: Any, shares: Any) -> None:
-    with pytest.raises(InputError, match="second derivatives"):
-        torch.func.hessian(means)(shares[0])
+    refuses("second derivatives", torch.func.hessian(means), shares[0])
     shares.requires_grad_()
     (first,) = torch.autograd.grad(means(shares).sum(), shares, create_graph=True)
-    with pytest.raises(InputError, match="second derivatives"):
-        first.sum().backward()
+    refuses("second derivatives", first.sum().backward)
 
 
 def test_what_is_no_finger_is_refused() -> None:
-    with pytest.raises(InputError, match="the circuit has 2 GAPs"):
-        fs.torch.Simulator(shipped("two_fingers"))
-    with pytest.raises(InputError, match="the circuit is a str"):
-        fs.torch.Simulator("fingerpad.cir")
+    refuses("the circuit has 2 GAPs", fs.torch.Simulator, shipped("two_fingers"))
+    refuses("the circuit is a str", fs.torch.Simulator, "fingerpad.cir")
 
 
 def test_it_is_loaded_on_request_only_and_says_where_torch_is_missing() -> None:
@@ -302,9 +293,6 @@ def test_a_drive_that_cannot_be_run_is_named() -> None:
     drive = fs.torch.Drive(table1(), samples_of(2), 20e3, t_stop=9e-3)
     bad = samples_of(2)
     bad[1, 3] = np.nan
-    with pytest.raises(InputError, match="drive 1: sample number 3 is nan"):
-        drive(bad)
-    with pytest.raises(InputError, match="source is 'Vother'; allowed: one of Vdrive"):
-        fs.torch.Drive(table1(), samples_of(), 20e3, source="Vother")
-    with pytest.raises(InputError, match="unknown output 'force'"):
-        fs.torch.Drive(table1(), samples_of(), 20e3, "force")
+    refuses("drive 1: sample number 3 is nan", drive, bad)
+    refuses("source is 'Vother'; allowed: one of Vdrive", fs.torch.Drive, table1(), samples_of(), 20e3, source="Vother")
+    refuses("unknown output 'force'", fs.torch.Drive, table1(), samples_of(), 20e3, "force")
