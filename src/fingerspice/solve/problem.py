@@ -78,7 +78,7 @@ class Problem:
     def largest(self) -> float:
         """Larger one of the sources' peak and the largest live voltage of the start, V."""
         n = self.scene.network.k.shape[0]
-        return float(max(self.scene.u_peak, *map(abs, self.initial.y[:n].tolist())))
+        return float(max(self.scene.u_peak, 0.0, *map(abs, self.initial.y[:n].tolist())))
 
     @cached_property
     def rounding(self) -> float:
