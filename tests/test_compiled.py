@@ -389,7 +389,6 @@ PARTS = {
     "numba.core.codegen": "JITCodeLibrary._finalize_final_module JITCodeLibrary._optimize_final_module "
     "JITCodeLibrary._finalize_dynamic_globals JITCPUCodegen.magic_tuple",
     "numba.core.compiler": "CompileResult._reduce CompileResult._rebuild Flags compile_extra",
-    "numba.core.compiler_machinery": "PassManager._ENFORCING",
     "numba.core.dispatcher": "Dispatcher.compile Dispatcher.get_call_template Dispatcher.get_overload",
     "numba.core.runtime.nrt": "rtsys.initialize",
     "numba.core.types.functions": "BaseFunction.get_call_type",

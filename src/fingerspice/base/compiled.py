@@ -28,7 +28,6 @@ from numba.core.caching import CompileResultCacheImpl, IndexDataCacheFile, NullC
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult, Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.compiler_machinery import PassManager
 from numba.core.datamodel import models
 from numba.core.datamodel.registry import register_default
 from numba.core.runtime.nrt import rtsys
@@ -201,19 +200,14 @@ def _call_type(function: Any, context: Any, args: Any, kws: Any) -> Any:
 
 @contextmanager
 def _swiftly() -> Iterator[None]:
-    """Context of a compilation, without collection of cycles: it makes millions of objects that live until it ends.
-
-    Nor does numba look for live variables after every pass that changed a function: passes do that where they need it.
-    """
+    """Context of a compilation, without collection of cycles: it makes millions of objects that live until it ends."""
     looking = gc.isenabled()
     gc.disable()
-    cast(Any, PassManager)._ENFORCING = False
     cast(Any, BaseFunction).get_call_type = _call_type
     try:
         yield
     finally:
         cast(Any, BaseFunction).get_call_type = _find
-        cast(Any, PassManager)._ENFORCING = True
         if looking:
             gc.enable()
 
