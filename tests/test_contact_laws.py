@@ -303,15 +303,15 @@ def two_scales(u: float, p_sat: float) -> tuple[float, float]:
 
 @pytest.mark.parametrize("p_sat", [50e3, 300e3])
 def test_a_saturating_contact_has_the_areas_and_the_friction_of_its_equations(p_sat: float) -> None:
-    solution = fs.simulate(table1(gap={"p_sat": p_sat}), t_eval=TIMES, rtol=1e-8)
+    solution = fs.simulate(table1(gap={"p_sat": p_sat}), t_eval=TIMES[:26], rtol=1e-8)
     area, real = np.array([two_scales(abs(u), p_sat) for u in solution.u_gap.tolist()]).T
     np.testing.assert_allclose(solution.area, area, rtol=1e-10)
     np.testing.assert_allclose(solution.a_real, real, rtol=1e-10)
     np.testing.assert_allclose(solution.f_t, np.sqrt(np.pi / 8.0) * P.mu0 * p_sat * real, rtol=1e-10)
     np.testing.assert_allclose(solution.friction, solution.f_t / P.force_normal, rtol=1e-14)
     areas = np.vectorize(lambda u: two_scales(u, p_sat)[0])
-    found = reference(areas, TIMES[:6], sine_slope)
-    assert np.abs(solution.u_gap[:6] - found).max() <= max(solution.error.u_gap, 1e-8 * abs(solution.u_gap).max())
+    found = reference(areas, TIMES[:4], sine_slope)
+    assert np.abs(solution.u_gap[:4] - found).max() <= max(solution.error.u_gap, 1e-8 * abs(solution.u_gap).max())
 
 
 def test_without_a_limit_of_the_pressure_nothing_changes_and_the_real_area_grows_by_the_square() -> None:

@@ -493,10 +493,9 @@ def compare_laws(
     gaps = [gap.name for gap in circuit.by_device("GAP")]
     refuse(len(gaps) != 1, f"laws are compared of one GAP; this circuit has {', '.join(gaps) or 'none'}")
     refuse(len(laws) < 2, f"{len(laws)} laws are given; allowed: two or more, such as {{'jkr': [...], 'dmt': [...]}}")
-    fits = dict[str, Fit]()
-    for law, names in laws.items():
-        named = law.name if isinstance(law, ContactLaw) else law
-        fits[named] = fit(circuit.replace({f"{gaps[0]}.law": law}), data, names, **how)
+    named = [law.name if isinstance(law, ContactLaw) else law for law in laws]
+    under = [circuit.replace({f"{gaps[0]}.law": law}) for law in laws]
+    fits = {name: fit(one, data, paths, **how) for name, one, paths in zip(named, under, laws.values(), strict=True)}
     refuse(any(one.data.signal == "impedance" for one in fits.values()), "laws are compared by means or signals")
     values = next(iter(fits.values())).data.values
     sizes = [np.full(values.size, 1.0), np.abs(values)] if np.all(values != 0.0) else [np.full(values.size, 1.0)]
