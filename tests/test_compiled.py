@@ -216,8 +216,8 @@ with compiling.around():
 sweep.stop()
 """
 LINES = [
-    "fingerspice: note: compiling the steps of a series stack, about 30 s, only once: later runs find it on the disk",
-    "fingerspice: note: compiling the steps of a network, about 40 s, only once: later runs find it on the disk",
+    "fingerspice: note: compiling the steps of a series stack, about 20 s, only once: later runs find it on the disk",
+    "fingerspice: note: compiling the steps of a network, about 30 s, only once: later runs find it on the disk",
 ]
 
 

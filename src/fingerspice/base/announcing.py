@@ -13,8 +13,8 @@ _LOG = logging.getLogger("fingerspice")
 #: What takes the compiler more than ten seconds, by function and class of its first argument: what it is, and the time
 #: on one core of an x86-64 server of 2026.
 LONG = {
-    ("engine.collocation.loop.march_on", "OneArea"): "the steps of a series stack, about 30 s",
-    ("engine.collocation.loop.march_on", "ManyAreas"): "the steps of a network, about 40 s",
+    ("engine.collocation.loop.march_on", "OneArea"): "the steps of a series stack, about 20 s",
+    ("engine.collocation.loop.march_on", "ManyAreas"): "the steps of a network, about 30 s",
     ("engine.lanes.loops.span", "StackMarks"): "the steps of a recording, about 10 s",
     ("engine.lanes.loops.span", "MobileMarks"): "the steps of a recording, about 10 s",
     ("engine.lanes.loops.span", "NetworkMarks"): "the steps of a recording in a network, about 20 s",
