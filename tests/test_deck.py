@@ -130,6 +130,7 @@ def test_subcircuits_are_flattened_with_their_parameters_and_nodes() -> None:
         ".subckt inner x",
         "R1 x deep {q}",
         "R2 deep 0 1",
+        ".ic v(deep)=2 v(x)=1",
         ".ends inner",
         ".ends",
         ".ic v(xf.mid)=1",
@@ -144,7 +145,7 @@ def test_subcircuits_are_flattened_with_their_parameters_and_nodes() -> None:
     assert value(layer.params["d"]) == pytest.approx(3e-6)
     assert value(middle.body[0]) == pytest.approx(6e-6)
     assert value(first.body[0]) == pytest.approx(12e-6)
-    assert list(read.directives[".ic"][0].params) == ["v(xf.mid)"]
+    assert [[*one.params] for one in read.directives[".ic"]] == [["v(xf.xi.deep)", "v(xf.mid)"], ["v(xf.mid)"]]
 
 
 def test_a_native_device_wins_over_a_definition_of_its_name() -> None:

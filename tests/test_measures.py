@@ -27,11 +27,11 @@ def measured(*lines: str, elements: tuple[str, ...] = (), tran: str = ".tran 0.1
 
 # V(b) is 0.5 sin(W t).
 CLOSED = {
-    "AVG V(b) FROM=0 TO=5m": 0.5 * 2.0 / math.pi, "RMS V(b)": 0.5 / math.sqrt(2.0),
-    "INTEG V(b) FROM=1m TO=4m": 0.5 * (math.cos(W * 1e-3) - math.cos(W * 4e-3)) / W, "MAX V(b)": 0.5,
-    "MIN V(b) FROM=1m TO=3m": 0.5 * math.sin(W * 1e-3), "PP V(a,b)": 3.0, "MAX_AT V(b) TO=10m": 2.5e-3,
+    "AVERAGE V(b) FROM=0 TO=5m": 0.5 * 2.0 / math.pi, "RMS V(b)": 0.5 / math.sqrt(2.0),
+    "INTEGRAL V(b) FROM=1m TO=4m": 0.5 * (math.cos(W * 1e-3) - math.cos(W * 4e-3)) / W, "MAX V(b)": 0.5,
+    "MIN V(b) TD=1m TO=3m": 0.5 * math.sin(W * 1e-3), "PP V(a,b)": 3.0, "MAX_AT V(b) TO=10m": 2.5e-3,
     "MIN_AT V(b) FROM=10m TO=20m": 17.5e-3, "FIND V(a) AT=1.3m": 2.0 * math.sin(W * 1.3e-3),
-    "DERIV V(b) AT=1.3m": 0.5 * W * math.cos(W * 1.3e-3), "WHEN V(b)=0.2": math.asin(0.4) / W,
+    "DERIVATIVE V(b) AT=1.3m": 0.5 * W * math.cos(W * 1.3e-3), "WHEN V(b)=0.2": math.asin(0.4) / W,
     "WHEN V(b)=0.2 CROSS=2": 5e-3 - math.asin(0.4) / W, "WHEN V(b)=0.2 RISE=3": 20e-3 + math.asin(0.4) / W,
     "WHEN V(b)=-0.2 FALL=1": 5e-3 + math.asin(0.4) / W, "WHEN V(b)=0.2 CROSS=LAST": 45e-3 - math.asin(0.4) / W,
     "WHEN V(b)=level RISE=1 TD=3m": 10e-3 + math.asin(0.4) / W, "WHEN V(b)='level*2' FALL=1": 5e-3 - math.asin(0.8) / W,
@@ -39,17 +39,18 @@ CLOSED = {
     "TRIG V(b) VAL=0.1 RISE=1 TARG V(b) VAL=0.4 RISE=2": 10e-3 + (math.asin(0.8) - math.asin(0.2)) / W,
     "TRIG AT=1m TARG V(b)=0 FALL=1": 4e-3, "TRIG V(a)=1 CROSS=1 TD=2m TARG AT=9m": 9e-3 - (5e-3 - math.asin(0.5) / W),
     "RMS {V(a)-4*V(b)}": 0.0, "AVG {V(b)^2+level}": 0.125 + 0.2, "MAX par('2*V(b)*V(b)')": 0.5, "PP I(R2)": 1e-3,
-    "MAX I(V1)": 5e-4, "PARAM='2*m0+level'": 2.0 * 0.5 * 2.0 / math.pi + 0.2, "PARAM m3*2": 1.0,
+    "MAX I(V1)": 5e-4, "MIN I(I1)": -1e-3, "FIND I(I1) AT=2.5m": 1e-3,
+    "PARAM='2*m0+level'": 2.0 * 0.5 * 2.0 / math.pi + 0.2, "PARAM m3*2": 1.0,
 }  # fmt: skip
 
 
 def test_measures_are_their_closed_forms() -> None:
     lines = [f".meas tran m{k} {form}" for k, form in enumerate(CLOSED)]
-    found = measured(".param level=0.2", *lines)
+    found = measured(".param level=0.2", *lines, elements=("I1 0 c SIN(0 1m 100)", "R3 c 0 1k"))
     for k, (form, expected) in enumerate(CLOSED.items()):
         one = found[f"m{k}"]
         assert one.failed == "", form
-        size = 1e-10 if "I(V1)" not in form else 1e-6
+        size = 1e-10 if "I(V1)" not in form and "I(I1)" not in form else 1e-6
         assert one.value == pytest.approx(expected, rel=size, abs=1e-12), form
     assert found["m19"].at == pytest.approx(10e-3 + math.asin(0.8) / W, rel=1e-12)
 
@@ -205,12 +206,13 @@ def test_measures_of_a_sweep_are_their_closed_forms_and_those_of_ngspice(command
         shown = command(*words, "--no-plot").out
         assert "measure" in shown
         assert "159.2 Hz" in shown
-    rows = json.loads(command("ac", "rc.cir", "--no-plot", "--json").out)["sweeps"][0]["measures"]
-    assert rows[5]["value"] == pytest.approx(F * math.sqrt(3.0), rel=1e-10)
+        (sweep,) = json.loads(command(*words, "--no-plot", "--json").out)["sweeps"]
+        assert sweep["measures"][5]["value"] == pytest.approx(F * math.sqrt(3.0), rel=1e-10)
+        np.testing.assert_allclose(sweep["frequency"], found.frequency, rtol=1e-12)
 
 
 def test_measures_of_a_finger_in_a_sweep() -> None:
-    lines = "top WHEN u_gap(Xgap)=140", "f FIND F_EL(Xgap) AT=230", "no MAX friction(Xgap)"
+    lines = "top WHEN u_gap(Xgap)=140", "f FIND F_EL(Xgap) AT=230", "no MAX friction(Xgap)", "late FIND V(top) AT=1g"
     text = "".join(f".meas ac {line}\n" for line in lines)
     circuit = fs.parse_netlist(table1().text.replace(".tran", f"{text}.tran"))
     found = fs.phasor(circuit, np.geomspace(10.0, 1e4, 31))
@@ -218,12 +220,13 @@ def test_measures_of_a_finger_in_a_sweep() -> None:
     assert abs(at.u_gap[0]) == pytest.approx(140.0, rel=1e-9)
     assert found.measures["f"] == pytest.approx(at.f_el_mean[1], rel=1e-9)
     assert "no part of a sweep" in found.measured["no"].failed
+    assert found.measured["late"].failed.startswith("1e+09 Hz is outside")
     v_top = at.v_nodes[:, at.nodes.index("top")] - at.v_nodes[:, at.nodes.index("skin")]
     np.testing.assert_allclose(v_top, at.u_gap, rtol=1e-12)
 
 
 def test_harmonics_are_those_of_the_closed_form_and_of_ngspice() -> None:
-    circuit = deck("V1 a 0 SQUARE(2 100)", "R1 a 0 1k", "V2 b 0 SIN(0.5 1 100 0 0 30)", "R2 b 0 1k",
+    circuit = deck("V1 a 0 SQUARE(2 100)", "R1 a 0 1k", "V2 b 0 SIN(0.5 1 100 40m 0 30)", "R2 b 0 1k",
                    ".four 100 V(a) {V(b)*V(b)} I(R1)", ".tran 0.1m 50m uic")  # fmt: skip
     found = fs.simulate(circuit).fourier
     odd = np.arange(1, 10, 2)

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -135,9 +136,14 @@ def test_several_plots_and_complex_vectors_are_read(tmp_path: Path) -> None:
     head = "Title: t\nDate: d\nPlotname: AC Analysis\nFlags: complex\nNo. Variables: 2\nNo. Points: 2\n"
     head += "Variables:\n\t0\tfrequency\tfrequency\n\t1\tv(a)\tvoltage\nBinary:\n"
     z = np.array([[10.0, 1.0 + 2.0j], [100.0, 3.0 - 4.0j]], "<c16")
-    (tmp_path / "two.raw").write_bytes(2 * (head.encode() + z.tobytes()))
-    second = fs.read_raw(tmp_path / "two.raw", plot=1)
-    np.testing.assert_array_equal(second.vectors["v(a)"], z[:, 1])
+    rows = ["".join(f"{k}\t{f.real},0\n\t{v.real},{v.imag}\n" for k, (f, v) in enumerate(x)) for x in (z, z.conj())]
+    words = head.replace("Binary", "Values")
+    (tmp_path / "text.raw").write_text(f"{words}{rows[0]}\n{words}{rows[1]}")
+    for code in ("utf-16-le", "utf-8"):
+        (tmp_path / "two.raw").write_bytes(b"".join(head.encode(code) + x.tobytes() for x in (z, z.conj())))
+        for name, plot in ((name, plot) for name in ("two.raw", "text.raw") for plot in (0, 1)):
+            found = fs.read_raw(tmp_path / name, plot=plot)
+            np.testing.assert_array_equal(found.vectors["v(a)"], z[:, 1].conj() if plot else z[:, 1])
     refuses("has 2 plots; allowed: plot up to 1", fs.read_raw, tmp_path / "two.raw", plot=2)
     refuses("is AC Analysis, no run in time", fs.compare_raw, table1(), tmp_path / "two.raw")
 
@@ -172,6 +178,12 @@ def test_a_run_with_jumps_equals_its_own_raw_file(tmp_path: Path) -> None:
     compared = fs.compare_raw(circuit, run.to_raw(tmp_path / "jumps.raw"))
     assert {"v(drive)", "v(top)", "v(area)", "i(vdrive)"} <= set(compared.vectors)
     assert max(compared.differences.values()) < 1e-7
+    # Of several runs the first is compared.
+    several = {name: np.append(x, 2.0 * x) for name, x in compared.raw.vectors.items()}
+    again = fs.compare_raw(circuit, replace(compared.raw, vectors=several))
+    assert again.differences == compared.differences
+    v = compared.vectors["v(top)"][0]
+    assert "8 ms" in str(replace(compared, vectors={"v(top)": (v, v + 1e3 * (compared.solution.t == 8e-3))}))
 
 
 @pytest.mark.parametrize(("plot", "said"), [(-1, "plot"), ("a", "plot"), (1, "has 1 plots; allowed: plot up to 0")])

@@ -64,11 +64,12 @@ def test_figures_go_as_one_batch(line: str) -> None:
 
 @pytest.mark.parametrize("signals", [(), None])
 def test_a_bad_value_is_told_and_the_others_stand(signals: tuple[str, ...] | None) -> None:
-    found = fs.run_steps(deck(".step Xgap.d list 3u -1u 4u"), signals=signals, rtol=1e-5)
-    assert [x > 1 for x in found.status.values.tolist()] == [False, True, False]
-    assert np.isfinite(found.f_el_mean.values).tolist() == [True, False, True]
-    assert "Xgap.d = -1e-06" in found.attrs["failures"][0]
-    assert "allowed: more than 0" in found.attrs["failures"][0]
+    found = fs.run_steps(deck(".step Xgap.d list 3u -1u 4u -2u"), signals=signals, rtol=1e-5)
+    assert [x > 1 for x in found.status.values.tolist()] == [False, True] * 2
+    assert np.isfinite(found.f_el_mean.values).tolist() == [True, False] * 2
+    first, second = found.attrs["failures"]
+    assert "Xgap.d = -1e-06" in first
+    assert "allowed: more than 0" in second
 
 
 def test_changes_of_the_user_stay() -> None:
@@ -97,6 +98,12 @@ def test_a_source_and_the_end_of_a_run_are_stepped() -> None:
     assert "differ in time" in bad.attrs["failures"][0]
 
 
+def test_a_start_and_measures_follow_a_stepped_parameter() -> None:
+    body = "t\n.param x=1\nV1 b 0 0\nR1 a b 1k\nC1 a 0 1u\n.ic v(a)={x}\n.tran 10u 2m uic\n.step param x list 1 2\n"
+    found = fs.run_steps(fs.parse_netlist(f"{body}.meas tran later FIND V(a) AT={{x/1k}}\n.end\n"))
+    np.testing.assert_allclose(found.later, [math.exp(-1.0), 2.0 * math.exp(-2.0)], rtol=1e-7)
+
+
 def test_refused_requests() -> None:
     refuses(r"no \.step line", fs.run_steps, deck())
     refuses("allowed: figures such as", fs.run_steps, deck(".step gap list 1u 2u"), outputs=("f_el_men",))
@@ -104,6 +111,7 @@ def test_refused_requests() -> None:
         fs.run_steps(deck(".step gap list 1u 2u", ".meas tran u_gap MAX V(top)"))
     refuses("fewer outputs or signals", fs.run_steps, deck(".step gap 1u 2u 0.1n", tstep="10n"))
     refuses("no step has a result; the first: gap = -1", fs.run_steps, deck(".step gap list -1 -2"))
+    refuses("no DC operating", fs.operating_points, fs.parse_netlist("t\nV1 a 0 1\nC1 a b 1n\nC2 b 0 1n\n.end\n"))
     warns(r"\.step has no effect in one run", fs.simulate, deck(".step gap list 1u 2u"), rtol=1e-4)
 
 
@@ -219,7 +227,10 @@ def test_a_sweep_at_each_step_equals_its_closed_form(command: Command) -> None:
     head, *rows = Path("out/low_ac.csv").read_text().splitlines()
     assert head.startswith("r,C1.value [F],frequency [Hz],v:in [V],")
     assert (len(rows), rows[19].split(",")[:3]) == (20, ["4000.0", "2e-06", "1000.0"])
-    assert "corner" in command("run", "low.cir").out
+    Path("low.cir").write_text(LOW_PASS.replace("list 1k 4k", "1k 50k 1k\n.op"))
+    said = command("run", "low.cir").ok().out
+    assert all(words in said for words in ("corner", "... 60 more rows"))
+    assert len(Path("out/low_dc.csv").read_text().splitlines()) == 101
     for lack, line in ((".ac", ".ac dec {n} 10 1k"), (".step", ".step param r list 1k 4k\n.step C1 1u 2u 1u")):
         with pytest.raises(fs.InputError, match=rf"no \{lack} line; allowed: both"):
             fs.phasor_steps(fs.parse_netlist(LOW_PASS.replace(line, "")))
@@ -230,7 +241,11 @@ def test_a_sweep_at_each_step_equals_its_closed_form(command: Command) -> None:
 
 
 def test_a_deck_without_tran(command: Command) -> None:
-    Path("op.cir").write_text(DECK.format(lines=".op\n.dc V1 0 200 50", tstep="1u").replace(".tran 1u 50m uic\n", ""))
+    text = DECK.format(lines=".op\n.dc V1 0 200 50", tstep="1u").replace("SIN(0 {V} 100)", "120")
+    Path("op.cir").write_text(text.replace(".tran 1u 50m uic\n", ""))
+    op = json.loads(command("run", "op.cir", "--no-plot", "--charge-law", "mobile", "--json").ok().out)["op"]
+    assert op["u_gap"] == pytest.approx(analytic.dc_operating_point(120.0, analytic.table1_layers(100.0))[1], rel=1e-9)
+    assert op["fold_margin"] > 1.01  # of the local law 1
     done = command("run", "op.cir").ok()
     assert "operating point" in done.out
     assert Path("out/op_dc.png").is_file()
@@ -245,10 +260,17 @@ def test_an_elements_name_alone_is_its_one_value() -> None:
     np.testing.assert_allclose(found["v:c"], expected, rtol=1e-12)
 
 
+def test_a_swept_current_adds_to_a_source_before_its_jump() -> None:
+    body = "jump\n.param r=1k\nV1 a 0 PWL(0 3 0 9)\nR1 a b {r}\nI1 0 b 0\n.step param r list 1k 2k\n"
+    found = fs.operating_points(fs.parse_netlist(f"{body}.dc I1 0 2m 1m\n.end\n"))
+    assert (found["v:b"].dims, found.I1.attrs["units"]) == (("I1", "r"), "A")
+    np.testing.assert_allclose(found["v:b"], 3.0 + np.outer([0.0, 1e-3, 2e-3], [1e3, 2e3]), rtol=1e-12)
+
+
 def test_values_follow_the_temperature_as_in_ngspice(tmp_path: Path) -> None:
     circuit = fs.parse_netlist(TEMPERATURE)
     warm = 1.0 + 2e-3 * 50.0 - 5e-6 * 50.0**2
-    expected = {"R1": 1e3 * warm, "R2": 2e3 * (1.0 + 0.05 + 0.025), "R3": 3e3 * warm, "R4": 1250.0, "C1": 1.05e-6}
+    expected = {"R1": 1e3 * warm, "R2": 2e3 * (1.05 + 0.025), "R3": 3e3 * (warm - 0.05), "R4": 1250.0, "C1": 1.05e-6}
     for name, value in expected.items():
         assert circuit[name].values["value"] == pytest.approx(value, rel=1e-14), name
     found = fs.operating_points(circuit)

@@ -154,6 +154,8 @@ def currents_of(record: Signals, circuit: Circuit) -> dict[str, FloatArray]:
 class _Course:
     """A quantity between two times (s), as Chebyshev series on consecutive pieces."""
 
+    unit = "s"
+
     def __init__(self, solution: Solution, quantity: Quantity, since: float, until: float) -> None:
         self.values, self.since, self.until = values_of(solution, quantity), since, until
         # Currents of sources are known at the outputs only.
@@ -186,7 +188,7 @@ class _Course:
     def at(self, t: float, derivative: bool = False) -> float:
         """The value, or the derivative, at a time (s)."""
         if not self.since <= t <= self.until:
-            raise Failed(f"{t:g} s is outside the run or the window")
+            raise Failed(f"{t:g} {self.unit} is outside the run or the window")
         k = int(np.clip(np.searchsorted(self.begin, t, side="right") - 1, 0, self.begin.size - 1))
         place, series = 2.0 * (t - self.begin[k]) / self.length[k] - 1.0, self.series[k]
         if derivative:
@@ -228,6 +230,8 @@ class _Course:
 
 class _Swept(_Course):
     """A quantity between two frequencies (Hz), from phasors at the nodes of polynomials between those of a sweep."""
+
+    unit = "Hz"
 
     def __init__(self, sweep: Sweep, quantity: Quantity, since: float, until: float) -> None:
         inside = sweep.frequency[(sweep.frequency > since) & (sweep.frequency < until)]
@@ -307,10 +311,10 @@ class Sweep:
 
 
 def _course(run: Solution | Sweep, quantity: Quantity, since: float, until: float) -> _Course:
-    unit = "Hz" if isinstance(run, Sweep) else "s"
+    kind = _Swept if isinstance(run, Sweep) else _Course
     if not since < until:
-        raise Failed(f"its window from {since:g} to {until:g} {unit} is empty")
-    return (_Swept if isinstance(run, Sweep) else _Course)(run, quantity, since, until)  # type: ignore[arg-type]
+        raise Failed(f"its window from {since:g} to {until:g} {kind.unit} is empty")
+    return kind(run, quantity, since, until)  # type: ignore[arg-type]
 
 
 def _time(solution: Solution | Sweep, crossing: Crossing, since: float, until: float) -> float:
@@ -353,10 +357,10 @@ def _made(solution: Solution | Sweep, one: Measure, known: Mapping[str, float]) 
             return Measured(float(one.formula(known)))
         except Exception as error:
             raise Failed(f"its expression has no value: {error or type(error).__name__}") from None
-    first, last = solution.first, _reached(solution)
+    first, last, unit = solution.first, _reached(solution), "Hz" if isinstance(solution, Sweep) else "s"
     since, until = one.since if one.since is not None else first, one.until if one.until is not None else last
     if since < first or until > last * (1.0 + 1e-12):
-        raise Failed(f"its window from {since:g} to {until:g} s is not within the run from {first:g} to {last:g} s")
+        raise Failed(f"its window from {since:g} to {until:g} is not within the run from {first:g} to {last:g} {unit}")
     until = min(until, last)
     if one.kind == "trig":
         assert one.start is not None

@@ -265,7 +265,8 @@ def _found(
     # Filters of warnings apply to all threads.
     with warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(processors()) as pool:
         list(pool.map(one, range(len(scenes))))
-    refuse(len(failures) == len(rows), f"no step has a result; the first: {failures.get(0)}")
+    none = f"{'no step has a result; the first: ' * bool(steps)}{failures.get(0)}"
+    refuse(len(failures) == len(rows), none)
     axis = next((name for row in rows for name, one in row.items() if one[0] == (name,)), "")
     t = max((row[axis][1] for row in rows if axis in row), key=np.size, default=np.empty(0))
     for k, row in enumerate(rows):
